@@ -1,0 +1,35 @@
+"""Visible-domain hulls for NeRF and Gaussian splatting from a handful of posed, masked photographs.
+
+Names are imported when they are first used, so that commands answer `--help` without loading torch.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Cameras": "visdom_plugin.cameras",
+    "Rays": "visdom_plugin.cameras",
+    "Render": "visdom_plugin.render",
+    "Scene": "visdom_plugin.scene",
+    "Views": "visdom_plugin.scene",
+    "VisDomError": "visdom_plugin.errors",
+    "EmptyHullError": "visdom_plugin.errors",
+    "VisibleDomain": "visdom_plugin.hull.domain",
+    "Hull": "visdom_plugin.hull.hull",
+    "VisDomGaussianRegularizer": "visdom_plugin.hooks.regularizer",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name: str):
+    if name in _HOME:
+        return getattr(import_module(_HOME[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

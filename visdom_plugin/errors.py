@@ -1,0 +1,47 @@
+"""What can go wrong for a user, said so that they can mend it."""
+
+from __future__ import annotations
+
+
+class VisDomError(Exception):
+    """A user's problem: what is wrong, where, the likely cause, what to do about it.
+
+    Commands print it without a traceback and exit with status 2; programs catch it by its class.
+
+    Args:
+        what: One sentence that states the fault and the value seen.
+        where: The file, view or field it was found in.
+        cause: The likeliest cause, when it could be established.
+        todo: What to do, ideally the command to run next.
+    """
+
+    def __init__(self, what: str, *, where: object = None, cause: str | None = None, todo: str | None = None):
+        self.what, self.where, self.cause, self.todo = what, where, cause, todo
+        lines = [what]
+        if where is not None:
+            lines.append(f"  where: {where}")
+        if cause:
+            lines.append(f"  likely cause: {cause}")
+        if todo:
+            lines.append(f"  what to do: {todo}")
+        super().__init__("\n".join(lines))
+
+
+class SceneError(VisDomError):
+    """The data on disk, or the cameras and masks handed in, cannot be used as they are."""
+
+
+class EmptyHullError(VisDomError):
+    """No voxel satisfies the keep rule."""
+
+
+class ConfigError(VisDomError):
+    """A setting is out of range or contradicts another."""
+
+
+class CheckpointError(VisDomError):
+    """A run directory or checkpoint cannot be resumed or read."""
+
+
+class PluginError(VisDomError):
+    """A method or hook registered from outside cannot be used."""

@@ -1,0 +1,62 @@
+"""The two places where a constraint enters a trainer.
+
+Hooks never own an optimiser, never step, never know the method's name and never import a rasteriser: they
+are handed callables. Several hooks are a list, applied in order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from torch import Generator, Tensor
+
+from visdom_plugin.cameras import Cameras
+from visdom_plugin.render import Render
+
+
+class RayBounds(NamedTuple):
+    """Where along each ray samples may be taken."""
+
+    near: Tensor
+    """(...) distance from the origin in units of the direction's length."""
+    far: Tensor
+    """(...) same unit, >= near."""
+    hit: Tensor
+    """(...) bool, True where the ray meets the hull."""
+
+
+@runtime_checkable
+class SamplerHook(Protocol):
+    """What NeRF methods call where they would use near and far."""
+
+    def bound(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> RayBounds:
+        """Bounds inside [near, far]. Pure, without gradient, any leading shape.
+
+        Args:
+            origins, directions: (..., 3) world frame.
+            near, far: (...) the method's own bounds.
+        """
+        ...
+
+
+@runtime_checkable
+class GaussianHook(Protocol):
+    """What Gaussian splatting methods call at the start, for the loss, and after each step."""
+
+    def initial_points(self, n: int, generator: Generator) -> tuple[Tensor, Tensor]:
+        """At most `n` starting points: xyz (M, 3) world frame and rgb (M, 3) in [0, 1]."""
+        ...
+
+    def loss(
+        self, render: Callable[[Cameras], Render], step: int, generator: Generator
+    ) -> dict[str, Tensor]:
+        """Named, weighted scalars to add to the method's loss; empty when there is nothing to add.
+
+        `render` draws the current Gaussians from one camera, with gradients.
+        """
+        ...
+
+    def after_step(self, gaussians: Any, step: int) -> None:
+        """Called after the optimiser's step with the method's Gaussians."""
+        ...
