@@ -57,6 +57,9 @@ class GaussianHook(Protocol):
         """
         ...
 
-    def after_step(self, gaussians: Any, step: int) -> None:
-        """Called after the optimiser's step with the method's Gaussians."""
+    def after_step(self, gaussians: Any, step: int) -> Tensor | None:
+        """Called after the optimiser's step with the method's Gaussians (`.means` (N, 3) at least).
+
+        Returns (N,) bool, True for Gaussians the method should remove, or None.
+        """
         ...

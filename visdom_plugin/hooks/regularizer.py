@@ -1,0 +1,127 @@
+"""The visible domain as a soft constraint on Gaussians (the paper's section 4.3, equation for L_i)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Generator, Tensor
+
+from visdom_plugin.cameras import Cameras, interpolate
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.hull.hull import Hull
+from visdom_plugin.hull.paint import colour_points
+from visdom_plugin.hull.raycast import depth_and_silhouette
+from visdom_plugin.render import Render
+
+
+def outside_loss(alpha: Tensor, hull_mask: Tensor) -> Tensor:
+    """L_i = -(1 - M_i) log(1 - Mhat_i), averaged over the image: opacity beside the hull is penalised.
+
+    Pixels on the hull add nothing, whatever their opacity: the hull is an upper bound of the object.
+
+    Args:
+        alpha: (..., H, W) rendered opacity in [0, 1].
+        hull_mask: (..., H, W) bool, True where the hull is seen.
+
+    Returns:
+        Scalar.
+    """
+    # 1e-6 keeps the gradient of a fully opaque pixel finite: at most 1e6 / (H * W).
+    return torch.where(hull_mask, 0.0, -torch.log1p(-alpha.clamp(max=1 - 1e-6))).mean()
+
+
+class VisDomGaussianRegularizer:
+    """Initial points from a hull, and L_i on views interpolated between training cameras.
+
+    Three lines in any trainer of Gaussians:
+
+        hook = VisDomGaussianRegularizer(hull, cameras)
+        xyz, rgb = hook.initial_points(20_000)
+        loss = loss + sum(hook.loss(render).values())   # render(camera) -> object with .alpha (H, W)
+
+    Args:
+        hull: the visible domain; fixed from here on.
+        cameras: (N,) training cameras, N >= 2; their interpolation gives the views of L_i.
+        images: N images (H, W, 3) uint8 or float in [0, 1] that colour the initial points; grey without.
+        weight: lambda_3, the weight of L_i; the paper uses 0.01.
+        every, start: L_i is added on steps start, start + every, ...
+        views_per_step: interpolated views per loss.
+        points: "surface" draws initial points on the hull's surface, "volume" anywhere inside it.
+        prune_every: `after_step` marks Gaussians outside the hull on every n-th step; 0 never.
+        prune_margin_voxels: how far outside the hull a centre may lie, in voxels.
+
+    Raises:
+        ConfigError: for fewer than two cameras or a setting out of range.
+    """
+
+    def __init__(
+        self,
+        hull: Hull,
+        cameras: Cameras,
+        *,
+        images: Sequence[Tensor] | None = None,
+        weight: float = 0.01,
+        every: int = 1,
+        start: int = 0,
+        views_per_step: int = 1,
+        points: Literal["surface", "volume"] = "surface",
+        prune_every: int = 0,
+        prune_margin_voxels: float = 2.0,
+    ):
+        if cameras.shape == () or len(cameras) < 2:
+            raise ConfigError(
+                "VisDomGaussianRegularizer needs at least two training cameras to interpolate between",
+                todo="pass the batch of all training cameras",
+            )
+        if weight < 0 or every < 1 or views_per_step < 1 or points not in ("surface", "volume"):
+            raise ConfigError(
+                f"weight={weight}, every={every}, views_per_step={views_per_step}, points={points!r}: "
+                "weight must be >= 0, every and views_per_step >= 1, points 'surface' or 'volume'"
+            )
+        self.hull, self.cameras, self.images = hull, cameras.to("cpu"), images
+        self.weight, self.every, self.start, self.views_per_step = weight, every, start, views_per_step
+        self.points, self.prune_every = points, prune_every
+        self.prune_margin_voxels = prune_margin_voxels
+        self._look_at = torch.as_tensor(hull.centre).to(self.cameras.world_from_camera)
+
+    def initial_points(self, n: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Points to start from: xyz (n, 3) float32 world frame and rgb (n, 3) float32 in [0, 1]."""
+        draw = self.hull.sample_points if self.points == "surface" else self.hull.sample_inside
+        xyz = draw(n, generator).float()
+        if self.images is None:
+            return xyz, torch.full_like(xyz, 0.5)
+        return xyz, colour_points(self.hull, xyz, self.cameras, self.images)
+
+    def sample_camera(self, generator: Generator | None = None) -> Cameras:
+        """One camera between a random pair of training cameras, uniform in the pair and on the way."""
+        first, second = torch.randperm(len(self.cameras), generator=generator)[:2].tolist()
+        t = torch.rand((), generator=generator)
+        return interpolate(self.cameras[first], self.cameras[second], t, self._look_at)
+
+    def loss(
+        self, render: Callable[[Cameras], Render], step: int = 0, generator: Generator | None = None
+    ) -> dict[str, Tensor]:
+        """Weighted L_i of this step, {"visdom_outside": scalar}, or {} on steps without it.
+
+        Args:
+            render: draws the current Gaussians from one camera; only `.alpha` (H, W) is read.
+            step: the trainer's step.
+            generator: draws the views; the default is torch's global generator.
+        """
+        if self.weight == 0 or step < self.start or (step - self.start) % self.every:
+            return {}
+        total = 0.0
+        for _ in range(self.views_per_step):
+            camera = self.sample_camera(generator)
+            _, mask = depth_and_silhouette(self.hull, camera)
+            alpha = render(camera).alpha
+            total = total + outside_loss(alpha, mask.to(alpha.device))
+        return {"visdom_outside": self.weight / self.views_per_step * total}
+
+    def after_step(self, gaussians: Any, step: int) -> Tensor | None:
+        """(N,) bool, True for Gaussians the trainer should remove, or None when there is nothing to do."""
+        if not self.prune_every or step % self.prune_every:
+            return None
+        return ~self.hull.contains(gaussians.means.detach(), margin_voxels=self.prune_margin_voxels)
