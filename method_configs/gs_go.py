@@ -1,0 +1,51 @@
+"""3DGS-GO and its variants: what each sets, side by side.
+
+`full` is the published schedule. `quick` is the same method on a twelfth of the steps: every event keeps its
+place in the schedule, and step sizes that act on positions grow so that they cover the same way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from visdom_plugin.hooks.configs import RegularizerConfig
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.methods.configs import GsGoConfig
+from visdom_plugin.registry import Preset
+
+FULL = GsGoConfig()
+
+QUICK = GsGoConfig(
+    steps=1000,
+    initial_points=8_000,
+    max_gaussians=20_000,
+    sh_degree=1,
+    sh_every=300,
+    lr_means_steps=1_500,
+    densify_from=100,
+    densify_until=600,
+    densify_every=50,
+    prune_large_from=200,
+    opacity_reset_every=0,
+    floater_every=100,
+)
+
+MASK = {"mask_weight": 0.1}
+VD = MASK | {"hull": VisibleDomain(), "vd": RegularizerConfig(enabled=True)}
+
+
+def _preset(suffix: str, description: str, changes: dict) -> Preset:
+    return Preset(
+        name=f"3dgs-go{suffix}",
+        description=description,
+        target="visdom_plugin.methods.gs_go:GsGo",
+        quick=replace(QUICK, **changes),
+        full=replace(FULL, **changes),
+    )
+
+
+PRESETS = [
+    _preset("", "GaussianObject's coarse stage, initialised from its own hull", {}),
+    _preset("+mask", "3DGS-GO with the paper's silhouette weight 0.1", MASK),
+    _preset("+vd", "3DGS-GO in the visible domain: hull points, mask loss, L_i between the cameras", VD),
+]
