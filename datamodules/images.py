@@ -1,0 +1,172 @@
+"""Photographs, masks and depth maps from files: header checks first, then decoding and exact downscaling.
+
+Only PNG and JPEG are read. The size is taken from the header and compared with what the camera asks for
+before a pixel is decoded, and the file is checked for its end: the decoders underneath fill what is missing
+with grey and say nothing.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from visdom_plugin.errors import SceneError
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+# Start-of-frame markers of JPEG: all of 0xC0..0xCF but DHT (C4), JPG (C8) and DAC (CC).
+_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        SceneError: it is missing or cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise SceneError(
+            "an image file is missing", where=path, todo="copy it there, or take the view off the index files"
+        ) from None
+    except OSError as error:
+        raise SceneError(f"an image file cannot be read: {error.strerror}", where=path) from error
+
+
+def size_of(data: bytes, path: Path) -> tuple[int, int]:
+    """Width and height in pixels from the header of a complete PNG or JPEG.
+
+    Raises:
+        SceneError: another format, a damaged header or chunk, or a file that stops before its end.
+    """
+    if data.startswith(_PNG):
+        return _png_size(data, path)
+    if data.startswith(b"\xff\xd8"):
+        return _jpeg_size(data, path)
+    raise SceneError(
+        "the file is neither PNG nor JPEG" if data else "the file is empty",
+        where=path,
+        cause="another format behind this extension, or an interrupted copy",
+        todo="convert it to PNG or JPEG, or copy it again",
+    )
+
+
+def decode_photograph(data: bytes, path: Path) -> np.ndarray:
+    """(H, W, 3) uint8 RGB, as stored: EXIF orientation is ignored, as COLMAP does; alpha is dropped."""
+    import cv2
+
+    image = _decode(data, path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def decode_mask(data: bytes, path: Path) -> np.ndarray:
+    """(H, W) float32 in [0, 1] from any bit depth.
+
+    An alpha channel that varies is the mask; else the brightest colour channel is.
+    """
+    import cv2
+
+    image = _decode(data, path, cv2.IMREAD_UNCHANGED)
+    full = np.float32(np.iinfo(image.dtype).max)
+    if image.ndim == 3:
+        channels = image.shape[2]
+        alpha = image[..., -1] if channels in (2, 4) else None
+        if alpha is not None and alpha.min() != alpha.max():
+            image = alpha
+        else:
+            image = image[..., : 3 if channels >= 3 else 1].max(-1)
+    return image.astype(np.float32) / full
+
+
+def decode_depth(data: bytes, path: Path) -> np.ndarray:
+    """(H, W) float32: a 16-bit PNG of monocular depth times 1000, divided by 1000 again."""
+    import cv2
+
+    image = _decode(data, path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise SceneError(
+            f"a depth map must be a 16-bit grey PNG, this one has shape {image.shape} and type {image.dtype}",
+            where=path,
+            cause="the coloured preview was saved in its place",
+            todo="save depth x 1000 as 16-bit PNG, or remove the folder zoe_depth to train without it",
+        )
+    return image.astype(np.float32) / np.float32(1000)
+
+
+def shrink(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Exact area average of an (H, W) or (H, W, 3) image at a smaller size, type kept."""
+    import cv2
+
+    if image.shape[:2] == (height, width):
+        return image
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def shrink_nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The value nearest to each new pixel centre: depth must not be averaged across edges."""
+    rows = ((np.arange(height) + 0.5) * (image.shape[0] / height)).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * (image.shape[1] / width)).astype(np.int64)
+    return np.ascontiguousarray(image[rows[:, None], columns])
+
+
+def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
+    import cv2
+
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        image = None
+    if image is None:
+        _damaged(path, "the image cannot be decoded")
+    return image
+
+
+def _png_size(data: bytes, path: Path) -> tuple[int, int]:
+    """Walks the chunks, checks each one's CRC (PNG specification, section 5) and that IEND is reached."""
+    at, size = len(_PNG), None
+    while True:
+        if at + 12 > len(data):
+            _damaged(path, "the PNG stops before its end")
+        (length,), kind = struct.unpack_from(">I", data, at), data[at + 4 : at + 8]
+        if at + 12 + length > len(data):
+            _damaged(path, "the PNG stops before its end")
+        (crc,) = struct.unpack_from(">I", data, at + 8 + length)
+        if crc != zlib.crc32(memoryview(data)[at + 4 : at + 8 + length]):
+            _damaged(path, f"the PNG's chunk {kind.decode('latin-1')!r} has a wrong checksum")
+        if size is None:
+            if kind != b"IHDR" or length != 13:
+                _damaged(path, "the PNG does not begin with its header")
+            size = struct.unpack_from(">II", data, at + 8)
+        if kind == b"IEND":
+            return size
+        at += 12 + length
+
+
+def _jpeg_size(data: bytes, path: Path) -> tuple[int, int]:
+    """Walks the segments to the start of frame (ITU-T T.81, annex B) and looks for the end marker."""
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            _damaged(path, "the JPEG's header is damaged")
+        marker = data[at + 1]
+        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:
+            at += 1 if marker == 0xFF else 2
+            continue
+        if marker in _FRAMES and at + 9 <= len(data):
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            if data.rfind(b"\xff\xd9") < at:
+                _damaged(path, "the JPEG stops before its end")
+            return width, height
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        at += 2 + max(length, 2)
+    _damaged(path, "the JPEG stops inside its header")
+
+
+def _damaged(path: Path, what: str) -> NoReturn:
+    raise SceneError(
+        what, where=path, cause="an interrupted copy or a damaged disk", todo="copy the file again"
+    )
