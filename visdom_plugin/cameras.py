@@ -77,7 +77,9 @@ class Cameras:
         if convention == "opengl":
             motion = motion * motion.new_tensor([1.0, -1.0, -1.0, 1.0])
         batch = torch.broadcast_shapes(intrinsics.shape[:-2], motion.shape[:-2])
-        size = [torch.as_tensor(x, device=motion.device).to(torch.int64).expand(batch) for x in (width, height)]
+        size = [
+            torch.as_tensor(x, device=motion.device).to(torch.int64).expand(batch) for x in (width, height)
+        ]
         cameras = cls(intrinsics.expand(*batch, 3, 3), motion.expand(*batch, 4, 4), *size)
         _check(cameras)
         return cameras
@@ -125,9 +127,7 @@ class Cameras:
         """(..., 4, 4) rigid motion from world to camera coordinates."""
         rotation = self.world_from_camera[..., :3, :3].mT
         translation = -(rotation @ self.world_from_camera[..., :3, 3:])
-        return torch.cat(
-            [torch.cat([rotation, translation], -1), self.world_from_camera[..., 3:, :]], -2
-        )
+        return torch.cat([torch.cat([rotation, translation], -1), self.world_from_camera[..., 3:, :]], -2)
 
     def resized(self, width, height) -> Cameras:
         """Cameras whose images were resampled to another size, each axis by its own ratio."""
@@ -209,7 +209,9 @@ def rays_of(cameras: Cameras, uv_px: Tensor | None = None) -> Rays:
     image_shape = None
     if uv_px is None:
         if cameras.shape:
-            raise ValueError("rays_of needs uv_px for a batch of cameras; index one camera for all its pixels")
+            raise ValueError(
+                "rays_of needs uv_px for a batch of cameras; index one camera for all its pixels"
+            )
         height, width = int(cameras.height), int(cameras.width)
         image_shape = (height, width, 3)
         rows = torch.arange(height, device=cameras.intrinsics.device, dtype=cameras.intrinsics.dtype) + 0.5

@@ -68,7 +68,9 @@ def slerp(start: Tensor, end: Tensor, t: Tensor | float) -> Tensor:
     """
     relative = quaternion_from_matrix(start.mT @ end)  # w >= 0: the short way round
     sine = relative[..., 1:].norm(dim=-1)
-    half_angle = torch.atan2(sine, relative[..., 0]) * torch.as_tensor(t, dtype=start.dtype, device=start.device)
+    half_angle = torch.atan2(sine, relative[..., 0]) * torch.as_tensor(
+        t, dtype=start.dtype, device=start.device
+    )
     axis = relative[..., 1:] / sine.clamp_min(torch.finfo(start.dtype).tiny)[..., None]
     part = torch.cat([half_angle.cos()[..., None], half_angle.sin()[..., None] * axis], -1)
     return start @ matrix_from_quaternion(part)

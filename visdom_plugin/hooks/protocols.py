@@ -48,9 +48,7 @@ class GaussianHook(Protocol):
         """At most `n` starting points: xyz (M, 3) world frame and rgb (M, 3) in [0, 1]."""
         ...
 
-    def loss(
-        self, render: Callable[[Cameras], Render], step: int, generator: Generator
-    ) -> dict[str, Tensor]:
+    def loss(self, render: Callable[[Cameras], Render], step: int, generator: Generator) -> dict[str, Tensor]:
         """Named, weighted scalars to add to the method's loss; empty when there is nothing to add.
 
         `render` draws the current Gaussians from one camera, with gradients.

@@ -93,6 +93,4 @@ class GaussianOptimiser:
             prefix = f"adam.{name}."
             moments = {k[len(prefix) :]: v.clone() for k, v in state.items() if k.startswith(prefix)}
             if moments:
-                self.adam.state[new] = {
-                    k: v if k == "step" else v.to(new.device) for k, v in moments.items()
-                }
+                self.adam.state[new] = {k: v if k == "step" else v.to(new.device) for k, v in moments.items()}
