@@ -31,7 +31,10 @@ def test_kept_gaussians_continue_as_if_nothing_happened():
     pull(alone, 4)
     pull(together, 4)
     for name in RATES:
-        assert torch.equal(together.parameters[name], alone.parameters[name][kept])
+        # A row's place in a SIMD register decides the last bit.
+        torch.testing.assert_close(
+            together.parameters[name].data, alone.parameters[name][kept].data, rtol=1e-6, atol=1e-7
+        )
 
 
 def test_appended_gaussians_start_with_empty_moments_and_leave_the_others_alone():
@@ -45,7 +48,9 @@ def test_appended_gaussians_start_with_empty_moments_and_leave_the_others_alone(
     pull(together, 4)
     assert len(together) == 8
     for name in RATES:
-        assert torch.equal(together.parameters[name][:6], alone.parameters[name])
+        torch.testing.assert_close(
+            together.parameters[name][:6].data, alone.parameters[name].data, rtol=1e-6, atol=1e-7
+        )
 
 
 def test_overwriting_forgets_the_moments_of_that_parameter_only():
