@@ -102,7 +102,7 @@ def cameras_of(model: Model, images: Sequence[Registered]) -> Cameras:
         lens = model.cameras.get(image.camera_id)
         if lens is None:
             raise SceneError(
-                f"image {image.name} refers to camera {image.camera_id}, which the cameras file does not list",
+                f"image {image.name} refers to camera {image.camera_id}, which the model does not have",
                 where=model.folder,
                 cause="the cameras and images files come from different models, or one is damaged",
                 todo="export both from the same reconstruction",
@@ -128,7 +128,7 @@ def cameras_of(model: Model, images: Sequence[Registered]) -> Cameras:
 def _pinhole(lens: Intrinsics, name: str, folder: Path) -> list[list[float]]:
     if lens.model in _DISTORTED:
         raise SceneError(
-            f"image {name} was taken with lens model {lens.model}; only PINHOLE and SIMPLE_PINHOLE can be used",
+            f"image {name} has the lens model {lens.model}; only PINHOLE and SIMPLE_PINHOLE can be used",
             where=folder,
             cause="the photographs still have their lens distortion",
             todo=_UNDISTORT,
@@ -140,7 +140,8 @@ def _pinhole(lens: Intrinsics, name: str, folder: Path) -> list[list[float]]:
             todo=_UNDISTORT,
         )
     if lens.model == "SIMPLE_PINHOLE":
-        (f, cx, cy), fx, fy = lens.params, lens.params[0], lens.params[0]
+        fx, cx, cy = lens.params
+        fy = fx
     else:
         fx, fy, cx, cy = lens.params
     size_ok = lens.width > 0 and lens.height > 0 and lens.width * lens.height <= _MAX_PIXELS

@@ -37,8 +37,10 @@ def load(
     if path is None:
         from datamodules.synthetic import SyntheticConfig, make_scene
 
-        config = SyntheticConfig(seed=seed, downscale=downscale)
-        return make_scene(config if views is None else SyntheticConfig(config.size, views, seed=seed))
+        wanted = {} if views is None else {"train_views": views}
+        return make_scene(
+            SyntheticConfig(downscale=downscale, seed=seed, **wanted, **({} if test else {"test_views": 0}))
+        )
     root = Path(path).expanduser()
     try:
         is_folder = root.is_dir()

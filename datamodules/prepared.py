@@ -18,6 +18,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -61,9 +62,9 @@ def load_prepared(root: Path, *, views: int | None, downscale: float, test: bool
     """Reads a prepared scene.
 
     With `downscale` F the files of `images_<F>/` are taken as they are where that folder exists; otherwise
-    those of `images/` are averaged over areas to round(size / F). Masks are averaged in the same way and cut at
-    one half, so a part thinner than half a pixel of the smaller image is lost. Intrinsics follow each axis's
-    exact ratio. Only the wanted views are decoded, on all cores.
+    those of `images/` are averaged over areas to round(size / F). Masks are averaged in the same way and cut
+    at one half, so a part thinner than half a pixel of the smaller image is lost. Intrinsics follow each
+    axis's exact ratio. Only the wanted views are decoded, on all cores.
 
     Args:
         root: the scene's folder.
@@ -167,7 +168,7 @@ def _sorted_images(model: colmap.Model) -> list[colmap.Registered]:
     for image in model.images:
         _check_name(image.name, model.folder)
     ordered = sorted(model.images, key=lambda image: _stem(image.name))
-    for one, two in zip(ordered, ordered[1:]):
+    for one, two in pairwise(ordered):
         if _stem(one.name) == _stem(two.name):
             raise SceneError(
                 f"two registered images share the name {_stem(one.name)}: {one.name} and {two.name}",
@@ -241,7 +242,7 @@ def _read_views(folder: _Folder, wanted: Sequence[colmap.Registered], cameras: C
     import cv2
 
     depths = _inside(folder.root, "zoe_depth")
-    full = list(zip(cameras.width.tolist(), cameras.height.tolist()))
+    full = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
 
     def read(i: int) -> _View:
         try:
@@ -258,7 +259,7 @@ def _read_view(folder: _Folder, name: str, full: tuple[int, int], depths: Path |
     data = images.read_file(path)
     size = images.size_of(data, path)
     factor = folder.factor
-    if any(abs(s * factor - f) > (factor if factor > 1 else 0) for s, f in zip(size, full)):
+    if any(abs(s * factor - f) > (factor if factor > 1 else 0) for s, f in zip(size, full, strict=True)):
         raise SceneError(
             f"the image is {size[0]} x {size[1]} but its camera says {full[0]} x {full[1]}"
             + (

@@ -84,7 +84,7 @@ def _read(path: Path, registered: int) -> tuple[list[int], str]:
             raise SceneError(
                 f"{path.name} holds {word[:40]!r}, which is not an integer",
                 where=path,
-                todo="write zero-based positions in the name-sorted list of images, one per line (not file names)",
+                todo="write zero-based positions in the name-sorted list of images, not file names",
             )
     positions = [int(word) for word in words]
     if not positions:
