@@ -24,7 +24,9 @@ class Method(Protocol):
     total_steps: int
     """Length of the schedule; the trainer calls steps 0 .. total_steps - 1."""
 
-    def setup(self, views: Views, hooks: Sequence[Any], *, hull: Any, device: torch.device, seed: int) -> None:
+    def setup(
+        self, views: Views, hooks: Sequence[Any], *, hull: Any, device: torch.device, seed: int
+    ) -> None:
         """Builds parameters and optimisers from the training views.
 
         `hull` is the one the config asked for, or None when the config has no `hull` field. `hooks` is empty

@@ -1,0 +1,62 @@
+"""What every command does about errors, signals and messages."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Sequence
+
+from visdom_plugin.errors import VisDomError
+
+USER_ERROR, INTERRUPTED = 2, 130
+
+log = logging.getLogger(__name__)
+
+
+def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None = None) -> int:
+    """Calls a command and turns what it raises into an exit status.
+
+    Args:
+        command: takes the arguments, returns an exit status (None is 0).
+        argv: arguments without the program's name, by default those of the process.
+
+    Returns:
+        2 for a user's mistake (the message is on stderr, without traceback), 130 when interrupted.
+        Any other exception goes on, with a line that calls it a bug.
+    """
+    set_up_logging()
+    try:
+        return command(list(sys.argv[1:] if argv is None else argv)) or 0
+    except VisDomError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return USER_ERROR
+    except KeyboardInterrupt as signal:
+        resumable = type(signal).__name__ == "Interrupted"
+        print(
+            "interrupted" + ("; the same command resumes" if resumable else ""), file=sys.stderr, flush=True
+        )
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader went away, as in `visdom-methods | head`.
+        sys.stderr.close()
+        return 0
+    except Exception:
+        print("this is a bug in visdom-plugin or in a plugin; please report it with:", file=sys.stderr)
+        raise
+
+
+def set_up_logging(quiet: bool = False) -> None:
+    """Warnings, and with `quiet` only errors, on stderr."""
+    root = logging.getLogger()
+    if not root.handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(_Plain())
+        root.addHandler(handler)
+    for name in ("visdom_plugin", "datamodules", "method_configs"):
+        logging.getLogger(name).setLevel(logging.ERROR if quiet else logging.INFO)
+
+
+class _Plain(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return text if record.levelno < logging.WARNING else f"{record.levelname.lower()}: {text}"

@@ -1,0 +1,56 @@
+"""visdom-eval: measures a run again from its last checkpoint."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from visdom_plugin.cli import errors
+
+
+@dataclass(frozen=True)
+class Options:
+    """Renders the test views of a run from its last checkpoint and measures them again."""
+
+    run: Path
+    """Run directory, as visdom-train names it."""
+    data: Path | None = None
+    """Where the scene is now, if it has moved."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return errors.run(_evaluate, argv)
+
+
+def _evaluate(argv: Sequence[str]) -> None:
+    import tyro
+
+    options = tyro.cli(
+        Annotated[Options, tyro.conf.configure(tyro.conf.PositionalRequiredArgs)],
+        args=argv,
+        prog="visdom-eval",
+    )
+    errors.set_up_logging(options.quiet)
+
+    from visdom_plugin.cli.report import say, show_result
+    from visdom_plugin.cli.scenes import open_run
+    from visdom_plugin.training.run import evaluate_again
+
+    record, config, scene, method, hull, device, step = open_run(options.run, options.data, options.device)
+    if record["status"] != "finished" and not options.quiet:
+        say(f"the run is {record['status']}: this is its state after {step} steps")
+    record = evaluate_again(method, config, hull, scene, device=device, run_dir=options.run)
+    if not options.quiet:
+        show_result(record, options.run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

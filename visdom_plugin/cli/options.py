@@ -1,0 +1,216 @@
+"""From the words on the command line to a method, its settings and the common options.
+
+Later wins: preset (by budget), then the file of --config, then the command line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, make_dataclass, replace
+from dataclasses import field as dataclass_field
+from pathlib import Path
+from typing import Any, Literal
+
+from visdom_plugin import registry
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.training.settings import as_plain, differences, from_plain
+
+WORD = "method:"
+
+
+@dataclass(frozen=True)
+class Common:
+    """Options of every training run."""
+
+    data: Path | None = None
+    """Folder of the scene; without it, the built-in scene."""
+    views: int = 4
+    """Training views."""
+    downscale: float = 1.0
+    """Work on images smaller by this factor."""
+    seed: int = 0
+    """Start of all random numbers."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; auto takes CUDA where there is one."""
+    budget: Literal["auto", "quick", "full"] = "auto"
+    """quick: minutes on two CPU cores; full: the published schedule; auto: quick on CPU, full on CUDA."""
+    out: Path | None = None
+    """Run directory; by default runs/<scene>/<views>/<method>/<seed>."""
+    overwrite: bool = False
+    """Throw away another run that is in the run directory."""
+    checkpoint_seconds: float = 30.0
+    """Seconds between two checkpoints; results do not depend on it."""
+    config: Path | None = None
+    """YAML file with settings, as --show-config prints them."""
+    show_config: bool = False
+    """Print all settings as YAML and stop; no training."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+SAVED = ("data", "views", "downscale", "seed", "device", "budget")
+"""Common options that a config file holds beside `method` and `settings`."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for, resolved."""
+
+    preset: registry.Preset
+    config: Any
+    """The method's settings."""
+    common: Common
+    """`budget` is "quick" or "full" here."""
+    note: str
+    """One line on which budget was chosen and why."""
+
+
+def parse(argv: Sequence[str], prog: str = "visdom-train") -> Request:
+    """Reads the command line.
+
+    Raises:
+        ConfigError: for an unknown or missing method, and for everything wrong in the file.
+        SystemExit: by tyro, for --help (0) and for unknown options or values (2).
+    """
+    import tyro
+
+    words, rest = [a for a in argv if a.startswith(WORD)], [a for a in argv if not a.startswith(WORD)]
+    if len(words) > 1:
+        raise ConfigError(f"one method at a time, please: {' '.join(words)}")
+    file_path = _scan(rest, "config")
+    file, where = ({}, "") if file_path is None else (_read(Path(file_path)), file_path)
+    name = words[0][len(WORD) :] if words else file.get("method")
+    if name is None:
+        _without_method(rest, prog)
+    preset = registry.find(str(name))
+    if words and "method" in file and registry.find(str(file["method"])) != preset:
+        raise ConfigError(
+            f"the file is for method:{file['method']}, the command line says {words[0]}",
+            where=where,
+            todo=f"make one for it: {prog} {words[0]} --show-config > FILE",
+        )
+    asking_help = any(a in ("-h", "--help") for a in rest)
+    budget, note = _choose_budget(rest, file, ask_torch=not asking_help)
+    config = getattr(preset, budget)
+    common = Common()
+    if file:
+        given = {k: v for k, v in file.items() if k in SAVED}
+        common = from_plain(common, given, where)
+        changed = from_plain(config, file.get("settings") or {}, where, "settings")
+        count = len(differences(as_plain(config), as_plain(changed)))
+        config, note = changed, f"{note}; {count} settings changed by {where}"
+    common = replace(common, budget=budget)
+    # One class for both, so that common options and those of the method stand in any order.
+    method = dataclass_field(default=config)
+    combined = make_dataclass("Train", [("method", type(config), method)], bases=(Common,), frozen=True)
+    parsed = tyro.cli(
+        combined,
+        prog=f"{prog} {WORD}{preset.name}",
+        description=f"{preset.name}: {preset.description}. Defaults shown: {note}.",
+        default=combined(**{f.name: getattr(common, f.name) for f in fields(Common)}, method=config),
+        args=rest,
+        config=(tyro.conf.AvoidSubcommands,),
+    )
+    common = Common(**{f.name: getattr(parsed, f.name) for f in fields(Common)})
+    return Request(preset, parsed.method, replace(common, budget=budget), note)
+
+
+def dump(request: Request) -> str:
+    """The YAML that `--config` reads back to the same request."""
+    import yaml
+
+    common = as_plain(request.common)
+    content = {"method": request.preset.name, **{k: common[k] for k in SAVED}}
+    content["settings"] = as_plain(request.config)
+    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+def _without_method(rest: Sequence[str], prog: str) -> None:
+    import tyro
+
+    known = registry.installed()
+    if any(a in ("-h", "--help") for a in rest):
+        lines = [f"{WORD}{p.name}: {p.description}." for p in known.presets.values()]
+        tyro.cli(
+            Common,
+            prog=f"{prog} {WORD}NAME",
+            description="Trains a method on posed, masked photographs.\n\n"
+            + "\n\n".join(lines)
+            + f"\n\nSettings of one method: {prog} {WORD}NAME --help",
+            args=["--help"],
+        )
+    stray = [a for a in rest if a in known.presets or a in known.aliases]
+    if stray:
+        raise ConfigError(f"a method is named with {WORD} before it", todo=f"{prog} {WORD}{stray[0]}")
+    raise ConfigError(
+        "no method is named",
+        todo=f"{prog} " + " | ".join(f"{WORD}{n}" for n in known.presets) + f"\n  help: {prog} --help",
+    )
+
+
+def _scan(argv: Sequence[str], option: str) -> str | None:
+    """The last value of an option, found before the real parser knows its defaults."""
+    value = None
+    for i, word in enumerate(argv):
+        if word == f"--{option}" and i + 1 < len(argv):
+            value = argv[i + 1]
+        elif word.startswith(f"--{option}="):
+            value = word.partition("=")[2]
+    return value
+
+
+def _choose_budget(rest: Sequence[str], file: dict[str, Any], ask_torch: bool) -> tuple[str, str]:
+    budget = _scan(rest, "budget") or file.get("budget", "auto")
+    if budget in ("quick", "full"):
+        return budget, f"budget {budget}"
+    device = _scan(rest, "device") or file.get("device", "auto")
+    # Help must not wait for torch: without a driver there is no CUDA, and with one it is the likely case.
+    if device == "auto":
+        device = "cuda" if Path("/dev/nvidiactl").exists() else "cpu"
+        if device == "cuda" and ask_torch:
+            device = resolve_device("auto")
+    budget = "full" if device == "cuda" else "quick"
+    return budget, f"budget {budget}, chosen for device {device}"
+
+
+def resolve_device(device: str) -> str:
+    """ "cpu" or "cuda" for "auto" and the rest.
+
+    Raises:
+        ConfigError: for CUDA where there is none.
+    """
+    import torch
+
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(
+            "there is no CUDA device",
+            where="--device cuda",
+            cause="no NVIDIA driver, or a CPU build of torch",
+            todo="leave --device out, or look at `visdom-methods --doctor`",
+        )
+    return device
+
+
+def _read(path: Path) -> dict[str, Any]:
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"the config file cannot be read: {error.strerror}", where=path) from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"the config file is not YAML: {error}", where=path) from error
+    content = {} if content is None else content
+    if not isinstance(content, dict):
+        raise ConfigError(f"the config file holds {type(content).__name__}, not settings", where=path)
+    valid = ("method", *SAVED, "settings")
+    for key in content:
+        if key not in valid:
+            raise ConfigError(
+                f"unknown setting {key!r}",
+                where=path,
+                todo=f"valid names at the top level: {', '.join(valid)}",
+            )
+    return content

@@ -1,0 +1,113 @@
+"""visdom-render: pictures or a video of a run along a camera path."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from visdom_plugin.cli import errors
+from visdom_plugin.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Options:
+    """Renders a run from its last checkpoint along a camera path, on white."""
+
+    run: Path
+    """Run directory, as visdom-train names it."""
+    path: Literal["orbit", "between", "train", "test"] = "orbit"
+    """orbit: a circle round the object; between: from training view to training view; train, test: these views."""
+    frames: int = 60
+    """Pictures along orbit and between."""
+    fps: int = 30
+    """Pictures per second of the video."""
+    format: Literal["mp4", "png"] = "mp4"
+    """A video, or a folder of numbered pictures."""
+    out: Path | None = None
+    """File or folder to write; by default <run>/renders/<path>.mp4 or <run>/renders/<path>/."""
+    data: Path | None = None
+    """Where the scene is now, if it has moved."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return errors.run(_render, argv)
+
+
+def _render(argv: Sequence[str]) -> None:
+    import tyro
+
+    options = tyro.cli(
+        Annotated[Options, tyro.conf.configure(tyro.conf.PositionalRequiredArgs)],
+        args=argv,
+        prog="visdom-render",
+    )
+    errors.set_up_logging(options.quiet)
+    for name in ("frames", "fps"):
+        if getattr(options, name) < 1:
+            raise ConfigError(f"--{name} is {getattr(options, name)}; it must be at least 1")
+
+    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.scenes import open_run
+    from visdom_plugin.training.evaluate import render_on_white
+    from visdom_plugin.training.pictures import to_bytes, write_png, write_video
+
+    _, _, scene, method, hull, device, _ = open_run(options.run, options.data, options.device)
+    cameras = choose_cameras(options.path, options.frames, scene, hull)
+    target = options.out or options.run / "renders" / (
+        f"{options.path}.mp4" if options.format == "mp4" else options.path
+    )
+    frames = []
+    for i in range(len(cameras)):
+        picture = to_bytes(render_on_white(method, cameras[i], device)[0])
+        if options.format == "png":
+            write_png(target / f"{i:04d}.png", picture)
+        else:
+            frames.append(picture)
+    if options.format == "mp4":
+        if len({frame.shape for frame in frames}) > 1:
+            raise ConfigError(
+                "the views differ in size, which a video cannot",
+                where=f"--path {options.path}",
+                todo="--format png",
+            )
+        codec = write_video(target, frames, options.fps)
+        if not options.quiet:
+            say(f"{len(frames)} frames, codec {codec}")
+    if not options.quiet:
+        sys.stdout.write(f"{target}\n")
+
+
+def choose_cameras(path: str, frames: int, scene, hull):
+    """(frames,) cameras of a path; the views' own for "train" and "test"."""
+    import torch
+
+    from visdom_plugin.cameras import Cameras, interpolate, look_at_point, orbit
+
+    if path in ("train", "test"):
+        return getattr(scene, path).cameras
+    cameras = scene.train.cameras
+    centre = look_at_point(cameras) if hull is None else torch.as_tensor(hull.centre)
+    if path == "orbit":
+        return orbit(cameras, frames, centre)
+    legs = max(len(cameras) - 1, 1)
+    along = [i * legs / max(frames - 1, 1) for i in range(frames)]
+    starts = [min(int(t), legs - 1) for t in along]
+    size = (cameras.width[0], cameras.height[0])
+    return Cameras.stack(
+        [
+            interpolate(cameras[s], cameras[min(s + 1, len(cameras) - 1)], t - s, centre).resized(*size)
+            for s, t in zip(starts, along, strict=True)
+        ]
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,60 @@
+"""What a command says on the terminal when it is done."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+ROWS = (
+    ("psnr", "PSNR", "dB"),
+    ("psnr_per_channel", "PSNR, mean of channels", "dB"),
+    ("ssim", "SSIM", ""),
+    ("psnr_foreground", "PSNR inside the mask", "dB"),
+    ("silhouette_iou", "silhouette IoU", ""),
+    ("outside_hull_mass", "opacity outside the hull", ""),
+    ("lpips", "LPIPS (VGG)", ""),
+)
+
+
+def say(text: str) -> None:
+    """One line for the user, on stderr so that stdout stays for results."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def show_result(record: dict[str, Any], folder: Path) -> None:
+    """The metrics table, the times and where the pictures are."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(soft_wrap=True)
+    table = Table(title=f"{record['method']} on {record['scene']}, {len(record['data']['test'])} test views")
+    table.add_column("metric")
+    table.add_column("mean", justify="right")
+    table.add_column("worst view", justify="right")
+    means, per_view = record["metrics"]["test"], record["metrics"]["per_view"]
+    for key, label, unit in ROWS:
+        if means.get(key) is None:
+            continue
+        values = [row[key] for row in per_view.values() if row[key] is not None]
+        worst = max(values) if key in ("outside_hull_mass", "lpips") else min(values)
+        digits = 2 if unit else 4
+        table.add_row(
+            label, f"{means[key]:.{digits}f} {unit}".rstrip(), f"{worst:.{digits}f} {unit}".rstrip()
+        )
+    console.print(table)
+    timing = record.get("timing", {})
+    if "train_s" in timing:
+        console.print(
+            f"training {timing['train_s']:.1f} s ({timing['step_ms']:.1f} ms a step), "
+            f"hull {timing['hull_s']:.2f} s, evaluation {timing['eval_s']:.1f} s"
+        )
+    for label, name in (
+        ("look at", "renders/test_sheet.png"),
+        ("renders", "renders/test"),
+        ("export", "export"),
+        ("hull", "hull/hull.ply"),
+        ("numbers", "run.json"),
+    ):
+        if (folder / name).exists():
+            console.print(f"{label:>8}: {folder / name}", highlight=False, markup=False)

@@ -1,0 +1,70 @@
+"""Where commands meet data: loading a run's scene again, batches for the trainer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from visdom_plugin.errors import CheckpointError
+from visdom_plugin.scene import Scene
+
+
+def make_data_manager(views, seed: int, device) -> Any:
+    """Batches of the training views on a device."""
+    from datamodules.manager import DataManager
+
+    return DataManager(views, seed, device=device)
+
+
+def load_again(record: dict[str, Any], run: Path, data: Path | None) -> Scene:
+    """The scene a run was trained on.
+
+    Args:
+        record: run.json's content.
+        data: where the scene lies now, when it has moved.
+
+    Raises:
+        CheckpointError: when what is found there is not what the run was trained on.
+        SceneError: when it cannot be read.
+    """
+    from datamodules import load
+    from visdom_plugin.training.rundir import hash_views
+
+    noted = record["data"]
+    path = data if data is not None else noted.get("path")
+    if path is not None and not Path(path).is_dir():
+        raise CheckpointError(
+            f"the run's scene is not at {path} any more", where=run, todo="say where it is with --data DIR"
+        )
+    scene = load(path, views=noted["views"], downscale=noted["downscale"], seed=noted["seed"])
+    if hash_views(scene.train) != noted["hashes"]["train_views"]:
+        raise CheckpointError(
+            f"the scene at {path or '(built-in)'} is not the one this run was trained on",
+            where=run,
+            cause="the images, masks or poses were changed, or another version of the software reads them",
+            todo="pass the right folder with --data DIR",
+        )
+    return scene
+
+
+def open_run(run: Path, data: Path | None, device_name: str):
+    """A trained method with its scene: (record, config, scene, method, hull, device).
+
+    Raises:
+        CheckpointError: when `run` is no run directory or has no checkpoint.
+    """
+    import torch
+
+    from visdom_plugin import registry
+    from visdom_plugin.cli.options import resolve_device
+    from visdom_plugin.training.run import restore
+    from visdom_plugin.training.rundir import read_record
+    from visdom_plugin.training.settings import from_plain
+
+    record = read_record(run)
+    preset = registry.find(record["method"])
+    config = from_plain(preset.full, record["config"], str(run / "run.json"))
+    device = torch.device(resolve_device(device_name))
+    scene = load_again(record, run, data)
+    method, hull, step = restore(preset, config, scene.train, run, device=device, seed=record["seed"])
+    return record, config, scene, method, hull, device, step

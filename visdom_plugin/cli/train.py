@@ -1,0 +1,72 @@
+"""visdom-train: from photographs to a trained, measured reconstruction."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from visdom_plugin.cli import errors, options
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return errors.run(_train, argv)
+
+
+def _train(argv: Sequence[str]) -> None:
+    request = options.parse(argv)
+    common = request.common
+    errors.set_up_logging(common.quiet)
+    if common.show_config:
+        sys.stdout.write(options.dump(request))
+        return
+    device = options.resolve_device(common.device)
+
+    from datamodules import load
+    from visdom_plugin.cli.report import say, show_result
+    from visdom_plugin.cli.scenes import make_data_manager
+    from visdom_plugin.training.run import train
+
+    scene = load(common.data, views=common.views, downscale=common.downscale, seed=common.seed)
+    folder = common.out or default_run_dir(scene.name, len(scene.train), request.preset.name, common.seed)
+    if not common.quiet:
+        data = "the built-in scene" if common.data is None else common.data
+        say(
+            f"{request.preset.name} on {data} ({scene.name}): {len(scene.train)} training views, {request.note}"
+        )
+        say(f"run directory: {folder}")
+    record = train(
+        request.preset.name,
+        request.config,
+        scene,
+        data_manager=make_data_manager,
+        run_dir=folder,
+        device=device,
+        seed=common.seed,
+        quiet=common.quiet,
+        overwrite=common.overwrite,
+        checkpoint_seconds=common.checkpoint_seconds,
+        budget=common.budget,
+        request={
+            "path": None if common.data is None else str(common.data.expanduser().resolve()),
+            "views": common.views,
+            "downscale": common.downscale,
+            "seed": common.seed,
+        },
+    )
+    if not common.quiet:
+        if record["already_finished"]:
+            say("this run is finished already; nothing was done (train again with --overwrite)")
+        show_result(record, folder)
+
+
+def default_run_dir(scene: str, views: int, method: str, seed: int) -> Path:
+    """runs/<scene>/<views>/<method>/<seed>, below the working directory."""
+    safe = re.sub(r"[^\w.+-]+", "_", scene).strip(".") or "scene"
+    return Path("runs") / safe / str(views) / method / str(seed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

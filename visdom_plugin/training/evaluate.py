@@ -1,0 +1,93 @@
+"""Renders the test views, measures them and draws the picture to look at first."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visdom_plugin.cameras import Cameras
+from visdom_plugin.errors import EmptyHullError
+from visdom_plugin.scene import Views
+from visdom_plugin.training import metrics
+from visdom_plugin.training.pictures import draw_sheet, picture_names, to_bytes, write_png
+from visdom_plugin.training.protocols import Method
+
+log = logging.getLogger(__name__)
+
+SHEET_VIEWS = 6
+
+
+def evaluate(
+    method: Method, views: Views, *, reference_hull: Any, device: torch.device, folder: Path | None = None
+) -> dict[str, Any]:
+    """Measures every view and, with a folder, writes its render and the contact sheet.
+
+    Args:
+        method: trained.
+        views: the test views.
+        reference_hull: the default visible domain of the training views, for `outside_hull_mass`; None
+            leaves that metric undefined.
+        device: where the method renders.
+        folder: `<folder>/test/<name>.png` and `<folder>/test_sheet.png` are written.
+
+    Returns:
+        {"test": means, "per_view": {name: metrics}}; see `metrics.compare`.
+    """
+    perceptual = metrics.load_lpips()
+    rows: dict[str, dict[str, float]] = {}
+    columns = []
+    shown = set(np.linspace(0, len(views) - 1, min(SHEET_VIEWS, len(views))).round().astype(int).tolist())
+    files = picture_names(views.names)
+    for i, name in enumerate(views.names):
+        rgb, alpha = render_on_white(method, views.cameras[i], device)
+        silhouette = None if reference_hull is None else hull_silhouette(reference_hull, views.cameras[i])
+        rows[name] = metrics.compare(
+            rgb,
+            alpha,
+            views.images[i],
+            views.masks[i],
+            hull_silhouette=silhouette,
+            perceptual=perceptual,
+        )
+        if folder is not None:
+            write_png(folder / "test" / f"{files[i]}.png", to_bytes(rgb))
+            if i in shown:
+                truth = to_bytes(metrics.whiten(views.images[i], views.masks[i]))
+                grey = to_bytes(alpha[..., None].expand(-1, -1, 3))
+                columns.append((f"{name}  {rows[name]['psnr']:.1f} dB", [truth, to_bytes(rgb), grey]))
+    if folder is not None and columns:
+        write_png(folder / "test_sheet.png", draw_sheet(columns, ["truth", "render", "alpha"]))
+    return {"test": metrics.mean_over_views(list(rows.values())), "per_view": rows}
+
+
+def render_on_white(method: Method, camera: Cameras, device: torch.device) -> tuple[Tensor, Tensor]:
+    """One view on white, on the CPU: rgb (H, W, 3) unclamped and alpha (H, W)."""
+    with torch.no_grad():
+        render = method.render(camera.to(device), torch.ones(3, device=device))
+    return render.rgb.detach().cpu(), render.alpha.detach().cpu()
+
+
+def carve_reference(views: Views, domain: Any = None) -> Any | None:
+    """The hull that `outside_hull_mass` is measured against: the default visible domain of these views.
+
+    The same for every method and variant. None, with a warning, when it is empty.
+    """
+    from visdom_plugin.hull.domain import VisibleDomain
+
+    try:
+        return (domain or VisibleDomain()).carve(views.cameras, views.masks)
+    except EmptyHullError as error:
+        log.warning("outside_hull_mass is left out: the reference hull is empty\n  %s", error.what)
+        return None
+
+
+def hull_silhouette(hull: Any, camera: Cameras) -> Tensor:
+    """(H, W) bool, True where a pixel's ray meets the hull."""
+    from visdom_plugin.hull.raycast import depth_and_silhouette
+
+    return torch.as_tensor(depth_and_silhouette(hull, camera)[1]).cpu()

@@ -1,0 +1,69 @@
+"""What a user sees while a run goes on: a bar on a terminal, a line every few seconds elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TextIO
+
+
+class Progress:
+    """Shows step, loss, training PSNR and the time left. As a context manager; silent when quiet."""
+
+    def __init__(self, total: int, start: int = 0, *, quiet: bool = False, stream: TextIO | None = None):
+        """
+        Args:
+            total: steps in all.
+            start: steps done before, by an earlier process.
+            stream: where to write, by default stderr.
+        """
+        self.total, self.start, self.quiet = total, start, quiet
+        self.stream = sys.stderr if stream is None else stream
+        self._bar = None
+        self._shown = 0.0
+
+    def __enter__(self) -> Progress:
+        self._begin = self._shown = time.monotonic()
+        if not self.quiet and self.stream.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+            from rich.progress import Progress as Bar
+
+            self._bar = Bar(
+                TextColumn("training"),
+                BarColumn(),
+                TextColumn("{task.completed}/{task.total} {task.fields[note]}"),
+                TimeElapsedColumn(),
+                TextColumn("left"),
+                TimeRemainingColumn(),
+                console=Console(file=self.stream),
+                refresh_per_second=4,
+            )
+            self._bar.start()
+            self._task = self._bar.add_task("", total=self.total, completed=self.start, note="")
+        return self
+
+    def __exit__(self, *_) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def show(self, done: int, loss: float | None = None, psnr: float | None = None, every: float = 5) -> None:
+        """Reports that `done` steps are done.
+
+        Args:
+            loss: of the last step measured.
+            psnr: of a training view, dB.
+            every: seconds between two lines when there is no terminal.
+        """
+        if self.quiet:
+            return
+        note = "" if loss is None else f"loss {loss:.4f}"
+        note += "" if psnr is None else f"  train PSNR {psnr:.2f}"
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, note=note)
+            return
+        now = time.monotonic()
+        if now - self._shown >= every or done == self.total:
+            self._shown = now
+            left = (now - self._begin) / max(done - self.start, 1) * (self.total - done)
+            print(f"step {done}/{self.total}  {note}  {left:.0f} s left", file=self.stream, flush=True)

@@ -1,0 +1,238 @@
+"""One training run from a scene to a finished run directory."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from visdom_plugin import registry
+from visdom_plugin.errors import CheckpointError
+from visdom_plugin.scene import Scene, Views
+from visdom_plugin.training import checkpoints
+from visdom_plugin.training.evaluate import carve_reference, evaluate
+from visdom_plugin.training.files import appearing, finite
+from visdom_plugin.training.protocols import Method
+from visdom_plugin.training.rundir import RunDir, describe_data
+from visdom_plugin.training.settings import as_plain
+from visdom_plugin.training.trainer import Trainer, view_psnr
+
+log = logging.getLogger(__name__)
+
+DataManager = Callable[[Views, int, torch.device], Any]
+"""(training views, seed, device) to an object whose `view_batch(step)` is a pure function."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal stopped the run; its state is saved."""
+
+
+def train(
+    preset_name: str,
+    config: Any,
+    scene: Scene,
+    *,
+    data_manager: DataManager,
+    run_dir: Path,
+    device: str | torch.device = "cpu",
+    seed: int = 0,
+    quiet: bool = False,
+    overwrite: bool = False,
+    checkpoint_seconds: float = 30,
+    request: dict[str, Any] | None = None,
+    budget: str | None = None,
+) -> dict[str, Any]:
+    """Trains, evaluates and writes the run directory; resumes the same run where it was left.
+
+    Nothing made of `scene.test` reaches the hull, the hooks or the method: they are handed `scene.train`.
+
+    Args:
+        preset_name: names the method's class; its settings are `config`.
+        request: how the scene was asked for, so that it can be loaded again: path, seed, views, downscale.
+        budget: noted in run.json.
+
+    Returns:
+        run.json's content, with `resumed_from` (step, or None) and `already_finished` added.
+
+    Raises:
+        CheckpointError: when `run_dir` belongs to another run or another process.
+        EmptyHullError: when the config's hull is empty.
+        TrainingError: when the optimisation diverges.
+        Interrupted: after Ctrl-C or SIGTERM, with the state saved.
+    """
+    preset = registry.find(preset_name)
+    device = torch.device(device)
+    identity = {
+        "method": preset.name,
+        "scene": scene.name,
+        "seed": seed,
+        "config": as_plain(config),
+        "data": describe_data(scene, request or {}),
+    }
+    with RunDir.open(run_dir, finite(identity), overwrite=overwrite) as run:
+        if run.record["status"] == "finished":
+            return run.record | {"resumed_from": None, "already_finished": True}
+        run.update(
+            status="running",
+            device=str(device),
+            versions=find_versions(),
+            threads=torch.get_num_threads(),
+            budget=budget,
+        )
+        resumed = max(checkpoints.list_steps(run.path / "checkpoints"), default=None)
+        try:
+            _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds)
+        except KeyboardInterrupt:
+            run.update(status="interrupted")
+            raise
+        except BaseException as error:
+            run.update(status="failed", error=f"{type(error).__name__}: {error}")
+            raise
+        return run.record | {"resumed_from": resumed, "already_finished": False}
+
+
+def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds) -> None:
+    method, hull, hull_s = build(preset, config, scene.train, device=device, seed=seed)
+    if hull is not None:
+        write_hull(hull, run.path / "hull")
+    batches = data_manager(scene.train, seed, device)
+    trainer = Trainer(
+        method,
+        batches.view_batch,
+        run,
+        device=device,
+        quiet=quiet,
+        checkpoint_seconds=checkpoint_seconds,
+        train_psnr=view_psnr(method, scene.train, device),
+    )
+    if not trainer.run():
+        raise Interrupted
+    began = time.monotonic()
+    found = assess(method, config, hull, scene, device=device, folder=run.path / "renders")
+    eval_s = time.monotonic() - began
+    export(method, run.path / "export")
+    step_ms = 1000 * trainer.train_s / max(trainer.step, 1)
+    run.record.pop("error", None)
+    run.update(
+        status="finished",
+        timing={"hull_s": hull_s, "train_s": trainer.train_s, "eval_s": eval_s, "step_ms": step_ms},
+        metrics=finite(found),
+    )
+
+
+def build(
+    preset: registry.Preset, config: Any, views: Views, *, device: torch.device, seed: int
+) -> tuple[Method, Any, float]:
+    """The method set up on the training views, its hull (None without one), and the carving's seconds."""
+    hull, hull_s = None, 0.0
+    if getattr(config, "hull", None) is not None:
+        began = time.monotonic()
+        hull = config.hull.carve(views.cameras, views.masks)
+        hull_s = time.monotonic() - began
+    vd = getattr(config, "vd", None)
+    hooks = [vd.build(hull, views)] if vd is not None and vd.enabled else []
+    method = preset.load()(config)
+    method.setup(views, hooks, hull=hull, device=device, seed=seed)
+    return method, hull, hull_s
+
+
+def restore(
+    preset: registry.Preset, config: Any, views: Views, path: Path, *, device: torch.device, seed: int
+) -> tuple[Method, Any, int]:
+    """The method in the state of a run directory's newest checkpoint, its hull, and that step.
+
+    Raises:
+        CheckpointError: when there is no checkpoint to read.
+    """
+    found = checkpoints.load_newest(Path(path) / "checkpoints")
+    if found is None:
+        raise CheckpointError(
+            "the run has no checkpoint that can be read", where=path, todo="run visdom-train again"
+        )
+    method, hull, _ = build(preset, config, views, device=device, seed=seed)
+    method.load_state_dict(found.tensors)
+    return method, hull, found.step
+
+
+def assess(
+    method: Method, config: Any, hull: Any, scene: Scene, *, device: torch.device, folder: Path
+) -> dict[str, Any]:
+    """Metrics and pictures of the test views; see `evaluate`."""
+    from visdom_plugin.hull.domain import VisibleDomain
+
+    same = hull is not None and config.hull == VisibleDomain()
+    reference = hull if same else carve_reference(scene.train)
+    return evaluate(method, scene.test, reference_hull=reference, device=device, folder=folder)
+
+
+def evaluate_again(
+    method: Method, config: Any, hull: Any, scene: Scene, *, device: torch.device, run_dir: Path
+) -> dict[str, Any]:
+    """Measures a restored method and puts the result into its run.json, which is returned.
+
+    Raises:
+        CheckpointError: when a process is training into the directory.
+    """
+    with RunDir.open_existing(run_dir) as run:
+        began = time.monotonic()
+        found = assess(method, config, hull, scene, device=device, folder=run.path / "renders")
+        timing = run.record.get("timing", {}) | {"eval_s": time.monotonic() - began}
+        run.update(metrics=finite(found), timing=timing)
+        return run.record
+
+
+def write_hull(hull: Any, folder: Path) -> None:
+    """hull.npz and hull.ply, each in one step; files that are there already are of the same run."""
+    if not (folder / "hull.npz").exists():
+        with appearing(folder / "hull.npz") as part:
+            hull.save(part)
+    if not (folder / "hull.ply").exists():
+        with appearing(folder / "hull.ply") as part:
+            write_mesh(part, *hull.to_mesh())
+
+
+def write_mesh(path: Path, vertices: Any, faces: Any) -> None:
+    """A triangle mesh as binary PLY."""
+    import numpy as np
+
+    vertices, faces = np.asarray(vertices, "<f4"), np.asarray(faces, "<i4")
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+    rows["count"], rows["corners"] = 3, faces
+    Path(path).write_bytes(header.encode() + vertices.tobytes() + rows.tobytes())
+
+
+def export(method: Method, folder: Path) -> list[Path]:
+    """The method's own export, file by file in one step each."""
+    import tempfile
+
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    with tempfile.TemporaryDirectory(prefix=".part-", dir=folder.parent) as draft:
+        for made in method.export(Path(draft)):
+            target = folder / Path(made).relative_to(draft)
+            with appearing(target) as part:
+                Path(made).replace(part)
+            written.append(target)
+    return written
+
+
+def find_versions() -> dict[str, str | None]:
+    """Versions of what the numbers depend on."""
+    found: dict[str, str | None] = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in ("visdom-plugin", "torch", "numpy", "numba", "gsplat"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    return found

@@ -1,0 +1,129 @@
+"""Config dataclasses to plain data and back, for YAML files and run.json."""
+
+from __future__ import annotations
+
+import types
+from dataclasses import fields, is_dataclass, replace
+from pathlib import PurePath
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from visdom_plugin.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def as_plain(value: Any) -> Any:
+    """Dataclasses to dicts, tuples to lists, paths to text: what JSON and YAML can hold."""
+    if is_dataclass(value):
+        return {f.name: as_plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, dict):
+        return {str(k): as_plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [as_plain(v) for v in value]
+    return str(value) if isinstance(value, PurePath) else value
+
+
+def from_plain(template: T, plain: Any, where: str, path: str = "") -> T:
+    """A dataclass like `template` with the given fields replaced.
+
+    Args:
+        template: gives the class and the values of the fields that `plain` leaves out.
+        plain: nested dict of field values, as `as_plain` makes it.
+        where: the file the values come from, for error messages.
+        path: name of the template inside the whole config, for error messages.
+
+    Raises:
+        ConfigError: for an unknown field (the valid ones are listed) or a value of the wrong type.
+    """
+    label = path or "the top level"
+    if not isinstance(plain, dict):
+        raise ConfigError(f"{label} must be a mapping, not {plain!r}", where=where)
+    valid = [f.name for f in fields(template) if f.init]
+    hints = get_type_hints(type(template))
+    changes = {}
+    for name, value in plain.items():
+        full = f"{path}.{name}" if path else str(name)
+        if name not in valid:
+            raise ConfigError(
+                f"unknown setting {full!r}", where=where, todo=f"valid names at {label}: {', '.join(valid)}"
+            )
+        current = getattr(template, name)
+        if is_dataclass(current) and isinstance(value, dict):
+            changes[name] = from_plain(current, value, where, full)
+            continue
+        ok, changes[name] = _coerce(value, hints[name])
+        if not ok:
+            raise ConfigError(f"{full} cannot be {value!r}", where=where, todo=f"give {_spell(hints[name])}")
+    return replace(template, **changes)
+
+
+def differences(a: Any, b: Any, path: str = "") -> list[str]:
+    """Where two plain values differ, one line each: "hull.k: 3 -> 2"."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        lines = []
+        for key in [*a, *(k for k in b if k not in a)]:
+            name = f"{path}.{key}" if path else key
+            lines += differences(a.get(key, _ABSENT), b.get(key, _ABSENT), name)
+        return lines
+    return [] if a == b else [f"{path}: {_short(a)} -> {_short(b)}"]
+
+
+class _Absent:
+    def __repr__(self) -> str:
+        return "(absent)"
+
+
+_ABSENT = _Absent()
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _coerce(value: Any, hint: Any) -> tuple[bool, Any]:
+    origin, args = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return True, value
+    if origin in (Union, types.UnionType):
+        # The exact type first, so that k: int | str keeps 3 a number.
+        for arm in sorted(args, key=lambda arm: arm is not type(value)):
+            ok, result = _coerce(value, arm)
+            if ok:
+                return True, result
+        return False, None
+    if origin is Literal:
+        return value in args and type(value) in {type(a) for a in args}, value
+    if hint is type(None):
+        return value is None, None
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            return False, None
+        arms = args[:1] * len(value) if len(args) == 2 and args[1] is Ellipsis else args
+        if len(arms) != len(value):
+            return False, None
+        parts = [_coerce(v, arm) for v, arm in zip(value, arms, strict=True)]
+        return all(ok for ok, _ in parts), tuple(v for _, v in parts)
+    if hint is float:
+        # YAML 1.1 reads 1e-3 as text.
+        if isinstance(value, str) and "e" in value.lower():
+            try:
+                return True, float(value)
+            except ValueError:
+                return False, None
+        return isinstance(value, (int, float)) and not isinstance(value, bool), (
+            float(value) if isinstance(value, (int, float)) else None
+        )
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool), value
+    if isinstance(hint, type) and issubclass(hint, PurePath):
+        return isinstance(value, str), hint(value) if isinstance(value, str) else None
+    if origin is None and isinstance(hint, type):
+        return isinstance(value, hint), value
+    return True, value
+
+
+def _spell(hint: Any) -> str:
+    if get_origin(hint) is Literal:
+        return "one of " + ", ".join(repr(a) for a in get_args(hint))
+    return "a value of type " + (hint.__name__ if isinstance(hint, type) else str(hint))

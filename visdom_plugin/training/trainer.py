@@ -1,0 +1,173 @@
+"""The loop: batch, losses, backward, optimiser, log, checkpoint; resumable at any step."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+
+from visdom_plugin.errors import VisDomError
+from visdom_plugin.training import checkpoints, metrics
+from visdom_plugin.training.progress import Progress
+from visdom_plugin.training.protocols import Method
+from visdom_plugin.training.rundir import RunDir
+
+LOGGED = 100
+"""Lines in log.jsonl over the whole schedule."""
+CUDA_CHECK_EVERY = 20
+"""On CUDA, reading the loss stalls the device: NaN is looked for on every n-th step and before saving."""
+
+
+class TrainingError(VisDomError):
+    """The optimisation went wrong."""
+
+
+class Trainer:
+    """Runs a method that was set up, from its newest checkpoint to the end of its schedule.
+
+    On the CPU the state after step n is a pure function of config, data and seed, for a fixed number of
+    threads (`OMP_NUM_THREADS`): when checkpoints are taken, and how often the run was killed, leaves no trace.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        batch_of: Callable[[int], Any],
+        run: RunDir,
+        *,
+        device: torch.device,
+        quiet: bool = False,
+        checkpoint_seconds: float = 30,
+        train_psnr: Callable[[int], float] | None = None,
+    ):
+        """
+        Args:
+            batch_of: the batch of a step, a pure function.
+            run: opened run directory.
+            checkpoint_seconds: time between two checkpoints; one is always taken at the end.
+            train_psnr: PSNR of a training view for the progress line, a function of the step; used where the
+                method has no `metrics` dict with a "psnr" of its own.
+        """
+        self.method, self.batch_of, self.run_dir = method, batch_of, run
+        self.device, self.quiet, self.checkpoint_seconds = device, quiet, checkpoint_seconds
+        self.train_psnr = train_psnr
+        self.folder = run.path / "checkpoints"
+        self.step, self.train_s = 0, 0.0
+        self.stopped = False
+
+    def run(self) -> bool:
+        """Trains to the end; False when a signal asked it to stop (the state is saved then).
+
+        Raises:
+            TrainingError: when the loss is no longer finite.
+        """
+        self._resume()
+        total = self.method.total_steps
+        log_every = max(1, total // LOGGED)
+        check_every = CUDA_CHECK_EVERY if self.device.type == "cuda" else 1
+        loss = psnr = None
+        saved = time.monotonic()
+        with (
+            _signals(self._stop),
+            Progress(total, self.step, quiet=self.quiet) as progress,
+        ):
+            while self.step < total and not self.stopped:
+                began = time.monotonic()
+                losses = self.method.train_step(self.batch_of(self.step), self.step)
+                whole = sum(losses.values())
+                due = (self.step + 1) % log_every == 0 or self.step + 1 == total
+                save = began - saved >= self.checkpoint_seconds or self.step + 1 == total or self.stopped
+                if due or save or (self.step + 1) % check_every == 0:
+                    loss = float(whole)
+                    if not abs(loss) < float("inf"):
+                        self._fail(losses)
+                whole.backward()
+                self.method.optimise(self.step)
+                self.step += 1
+                self.train_s += time.monotonic() - began
+                if due:
+                    psnr = self._measure_psnr(log_every)
+                    row = {"step": self.step, "loss": loss}
+                    row |= {f"loss_{k}": float(v) for k, v in losses.items()}
+                    self.run_dir.log(row | {"psnr": psnr, "train_s": round(self.train_s, 3)})
+                if save:
+                    self._save()
+                    saved = time.monotonic()
+                progress.show(self.step, loss, psnr)
+        if self.stopped and self.step < total:
+            self._save()
+            return False
+        return True
+
+    def _resume(self) -> None:
+        found = checkpoints.load_newest(self.folder)
+        if found is not None:
+            self.method.load_state_dict(found.tensors)
+            self.step, self.train_s = found.step, float(found.notes.get("train_s", 0))
+        for step in checkpoints.list_steps(self.folder):
+            if found is None or step > found.step:
+                checkpoints.remove(self.folder, step)
+        self.run_dir.truncate_log(self.step)
+
+    def _save(self) -> None:
+        if self.step not in checkpoints.list_steps(self.folder):
+            notes = {"train_s": self.train_s, "total_steps": self.method.total_steps}
+            checkpoints.save(self.folder, self.step, self.method.state_dict(), notes)
+
+    def _measure_psnr(self, log_every: int) -> float | None:
+        own = getattr(self.method, "metrics", {}).get("psnr")
+        if own is not None:
+            return float(own)
+        # A whole render costs several steps of some methods: every fifth line has one.
+        if self.train_psnr is None or (self.step // log_every) % 5:
+            return None
+        value = self.train_psnr(self.step)
+        return value if value == value and value != float("inf") else None
+
+    def _fail(self, losses: dict[str, Any]) -> None:
+        parts = ", ".join(f"{name} {float(value):.4g}" for name, value in losses.items())
+        raise TrainingError(
+            f"the loss is no longer a finite number at step {self.step} ({parts})",
+            where=self.run_dir.path,
+            cause="learning rates too high for this scene's scale, or a broken pose among the training views",
+            todo="try smaller learning rates, e.g. with --config; the last good state is in checkpoints/",
+        )
+
+    def _stop(self) -> None:
+        self.stopped = True
+
+
+@contextmanager
+def _signals(stop: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C and SIGTERM call `stop` once; a second Ctrl-C interrupts at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handle(number, frame) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        stop()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def view_psnr(method: Method, views: Any, device: torch.device) -> Callable[[int], float]:
+    """PSNR on white of one training view, another for every call's step."""
+    from visdom_plugin.training.evaluate import render_on_white
+
+    def measure(step: int) -> float:
+        i = step % len(views)
+        rgb, _ = render_on_white(method, views.cameras[i], device)
+        return metrics.psnr(metrics.quantise(rgb), metrics.whiten(views.images[i], views.masks[i]))
+
+    return measure
