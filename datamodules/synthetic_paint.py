@@ -45,7 +45,7 @@ def paint_object(points: np.ndarray, normals: np.ndarray, parts: np.ndarray) -> 
     wx = x + 0.05 * wave(1.9 * y + 1.3 * z)
     wy = y + 0.05 * wave(1.7 * z + 1.1 * x)
     wz = z + 0.035 * wave(2.3 * x + 0.7 * y) + 0.02 * wave(5.1 * y - 2.0 * x)
-    band = np.floor(11 * wz + 2 * (wx - wy)).astype(np.int64)
+    band = np.floor(9 * wz + 2 * (wx - wy)).astype(np.int64)
     colour = _BANDS[parts, band % 5]
     # Petals: cells of a warped lattice take the colour two bands on.
     petal = wave(2.6 * wx + 0.1) * wave(2.6 * wy - 0.2) + 0.55 * wave(3.1 * wz)
@@ -100,7 +100,7 @@ def _room(dx, dy, dz) -> np.ndarray:
 def _table(x, y) -> np.ndarray:
     plank = np.floor(2.4 * x)
     tone = 0.07 * wave(plank * np.float32(0.37)) + 0.05 * wave(plank * np.float32(0.173) + 0.2)
-    grain = wave(14 * x + 0.8 * wave(0.9 * y + plank * np.float32(0.31))) * (
+    grain = wave(6.5 * x + 0.8 * wave(0.9 * y + plank * np.float32(0.31))) * (
         0.5 + 0.5 * wave(0.7 * y + plank * np.float32(0.61))
     )
     seam = np.abs(2.4 * x - np.rint(2.4 * x)) < 0.025

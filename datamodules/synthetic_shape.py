@@ -8,6 +8,7 @@ overlaps: the mesh is the boundary of the solid.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -19,10 +20,10 @@ _RINGS = 92
 # (radius, height) of the turned profile: from the middle of the foot's underside, up the outside, over the
 # rim, down the inside to the middle of its floor.
 _PROFILE = [
-    (0.00, 0.03), (0.18, 0.03), (0.27, 0.00), (0.33, 0.01), (0.32, 0.06), (0.24, 0.11), (0.25, 0.16), (0.37, 0.24),
-    (0.47, 0.38), (0.49, 0.52), (0.45, 0.66), (0.36, 0.78), (0.31, 0.86), (0.33, 0.92), (0.38, 0.96), (0.37, 0.98),
-    (0.31, 0.93), (0.275, 0.86), (0.32, 0.77), (0.405, 0.66), (0.44, 0.52), (0.42, 0.39), (0.34, 0.28), (0.18, 0.22),
-    (0.00, 0.21),
+    (0, 0.03), (0.18, 0.03), (0.27, 0), (0.33, 0.01), (0.32, 0.06), (0.24, 0.11), (0.25, 0.16),
+    (0.37, 0.24), (0.47, 0.38), (0.49, 0.52), (0.45, 0.66), (0.36, 0.78), (0.31, 0.86), (0.33, 0.92),
+    (0.38, 0.96), (0.37, 0.98), (0.31, 0.93), (0.275, 0.86), (0.32, 0.77), (0.405, 0.66), (0.44, 0.52),
+    (0.42, 0.39), (0.34, 0.28), (0.18, 0.22), (0, 0.21),
 ]  # fmt: skip
 _FOOT_TOP, _FLOOR, _RIM = 0.12, 0.21, 0.98
 
@@ -142,7 +143,7 @@ class _Body:
             angles = self._angles(far, normal[-1], across)
             turns = [np.cos(np.roll(angles, -k) - phase).sum() for k in range(len(far))]
             rows.append(np.roll(far, -int(np.argmax(turns))))
-        for one, two in zip(rows, rows[1:], strict=False):
+        for one, two in pairwise(rows):
             self._strip(one, two, part)
 
     def finish(self) -> Shape:
