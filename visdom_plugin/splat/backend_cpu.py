@@ -34,7 +34,7 @@ def rasterise_cpu(
         means2d.retain_grad()
     rgb, alpha, depth = _Blend.apply(means2d, splats, extents, background, width, height)
     info = {
-        "means2d": means2d, "radii": radii, "visible": (radii > 0).any(-1), "depths": splats[:, 7].detach(),
+        "means2d": means2d, "radii": radii, "visible": (radii > 0).all(-1), "depths": splats[:, 7].detach(),
         "width": width, "height": height,
     }  # fmt: skip
     return Render(rgb, alpha, depth, info)

@@ -70,9 +70,8 @@ def _open_rows(s):
 @njit(cache=True, error_model="numpy", nogil=True)
 def _rows(v, reach, top):
     """Rows of a tile whose pixel centres lie within `reach` of v: first and one past the last."""
-    return int(math.ceil(max(v - reach - 0.5 - top, 0))), int(
-        math.floor(min(v + reach - 0.5 - top, TILE - 1))
-    ) + 1
+    first, last = math.ceil(max(v - reach - 0.5 - top, 0)), math.floor(min(v + reach - 0.5 - top, TILE - 1))
+    return first, last + 1
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
