@@ -1,0 +1,304 @@
+"""The hull: an occupancy grid in the world frame, and what can be asked of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from visdom_plugin.errors import CheckpointError, ConfigError
+from visdom_plugin.hull.mesh import mesh_grid
+
+_SCHEMA = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """Voxels that may hold the object. Never changed after it is made."""
+
+    occupancy: np.ndarray
+    """(X, Y, Z) bool; voxel (0, 0, 0) lies at the lower corner."""
+    bounds: np.ndarray
+    """(2, 3) float64 lower and upper corner of the grid, world frame."""
+    summary: dict[str, Any] = field(default_factory=dict)
+    """How it was carved: rule, views, seconds, components; plain numbers and strings."""
+    _derived: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def from_grid(cls, array, bounds, summary: dict[str, Any] | None = None) -> Hull:
+        """A hull from any occupancy grid.
+
+        Args:
+            array: (X, Y, Z) tensor or array; bool, or numbers of which those above 0.5 are inside.
+            bounds: (2, 3) lower and upper corner, world frame.
+
+        Raises:
+            ConfigError: for a grid that is not three-dimensional, or bounds without extent.
+        """
+        array = array.detach().cpu().numpy() if isinstance(array, Tensor) else np.asarray(array)
+        bounds = bounds.detach().cpu().numpy() if isinstance(bounds, Tensor) else bounds
+        bounds = np.array(bounds, np.float64)
+        if array.ndim != 3 or array.size == 0:
+            raise ConfigError(f"a hull needs a grid (X, Y, Z), not shape {array.shape}")
+        if bounds.shape != (2, 3) or not np.isfinite(bounds).all() or not (bounds[1] > bounds[0]).all():
+            raise ConfigError(
+                f"bounds {bounds.tolist()} are not two corners with lower < upper",
+                todo="pass ((x, y, z), (x, y, z)) in world units",
+            )
+        occupancy = array if array.dtype == np.bool_ else array > 0.5
+        return cls(np.ascontiguousarray(occupancy), bounds, summary or {})
+
+    def __getstate__(self):
+        return self.__dict__ | {"_derived": {}}
+
+    def _once(self, key, make: Callable[[], Any]) -> Any:
+        if key not in self._derived:
+            self._derived[key] = make()
+        return self._derived[key]
+
+    def __eq__(self, other) -> bool:
+        if not isinstance(other, Hull):
+            return NotImplemented
+        same = np.array_equal(self.bounds, other.bounds)
+        return same and np.array_equal(self.occupancy, other.occupancy)
+
+    __hash__ = None
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Voxels along x, y, z."""
+        return self.occupancy.shape
+
+    @property
+    def voxel_edges(self) -> np.ndarray:
+        """(3,) edges of a voxel in scene units; equal for every hull that was carved."""
+        return (self.bounds[1] - self.bounds[0]) / np.array(self.shape)
+
+    @property
+    def voxel_size(self) -> float:
+        """Edge of a voxel in scene units; the geometric mean should a foreign grid's voxels not be cubes."""
+        return float(np.prod(self.voxel_edges) ** (1 / 3))
+
+    @property
+    def voxels(self) -> int:
+        """Number of occupied voxels."""
+        return self._once("voxels", lambda: int(np.count_nonzero(self.occupancy)))
+
+    @property
+    def volume(self) -> float:
+        """Occupied voxels times the volume of one, cubic scene units."""
+        return self.voxels * float(np.prod(self.voxel_edges))
+
+    @property
+    def surface_area(self) -> float:
+        """Area of the mesh, square scene units. The steps between voxels make it larger than a smooth surface's."""
+        return float(self._areas().sum())
+
+    @property
+    def extent(self) -> np.ndarray:
+        """(2, 3) tight box around the occupied voxels, world frame; the grid's own box for an empty hull."""
+        return self._once("extent", lambda: self.bounds[0] + _occupied_box(self.occupancy) * self.voxel_edges)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) mean of the occupied voxels' centres, world frame; of the box for an empty hull."""
+        return self._once("centre", self._find_centre)
+
+    @property
+    def radius(self) -> float:
+        """Distance from `centre` to the farthest point of the mesh, scene units; 0 for an empty hull."""
+
+        def measure():
+            vertices, _ = self.to_mesh()
+            return float(np.linalg.norm(vertices - self.centre, axis=1).max(initial=0))
+
+        return self._once("radius", measure)
+
+    def _find_centre(self) -> np.ndarray:
+        if not self.voxels:
+            return self.bounds.mean(0)
+        weights = [self.occupancy.sum(axis=tuple({0, 1, 2} - {a}), dtype=np.int64) for a in range(3)]
+        index = np.array([(w * (np.arange(len(w)) + 0.5)).sum() / w.sum() for w in weights])
+        return self.bounds[0] + index * self.voxel_edges
+
+    def contains(self, points, *, margin_voxels: float = 0.0):
+        """Whether points lie in occupied voxels. Points outside the grid do not.
+
+        Args:
+            points: (..., 3) tensor on any device, or array; world frame.
+            margin_voxels: count points up to this far from an occupied voxel as inside, in voxels, largest
+                difference over the axes, rounded up to whole voxels.
+
+        Returns:
+            (...) bool, of the same kind and on the same device.
+        """
+        if not isinstance(points, Tensor):
+            return self.contains(torch.as_tensor(np.asarray(points)), margin_voxels=margin_voxels).numpy()
+        reach = int(np.ceil(margin_voxels))
+        grid = self._grid_on(points.device, reach)
+        lower = torch.as_tensor(self.bounds[0] - reach * self.voxel_edges, device=points.device)
+        size = torch.tensor(grid.shape, device=points.device)
+        index = torch.floor(
+            (points.detach().double() - lower) / torch.as_tensor(self.voxel_edges, device=points.device)
+        )
+        inside = ((index >= 0) & (index < size)).all(-1)
+        x, y, z = torch.where(inside[..., None], index, 0.0).long().unbind(-1)
+        return inside & grid[x, y, z]
+
+    def _grid_on(self, device: torch.device, reach: int = 0) -> Tensor:
+        def make():
+            grid = self.occupancy
+            if reach:
+                from scipy.ndimage import maximum_filter
+
+                grid = maximum_filter(np.pad(grid, reach), size=2 * reach + 1)
+            return torch.from_numpy(grid).to(device)
+
+        return self._once(("grid", str(device), reach), make)
+
+    def to_mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """The surface of the occupied voxels.
+
+        Returns:
+            Vertices (V, 3) float64, world frame, and faces (F, 3) int64: closed, outward (anticlockwise seen
+            from outside), every edge in exactly two faces.
+        """
+
+        def make():
+            lower, upper = _occupied_box(self.occupancy).astype(int)
+            window = tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))
+            vertices, faces = mesh_grid(self.occupancy[window])
+            return self.bounds[0] + (vertices + lower) * self.voxel_edges, faces
+
+        return self._once("mesh", make)
+
+    def _areas(self) -> np.ndarray:
+        def make():
+            vertices, faces = self.to_mesh()
+            a, b, c = (vertices[faces[:, i]] for i in range(3))
+            return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+        return self._once("areas", make)
+
+    def sample_points(self, n: int, generator: Generator | None = None) -> Tensor:
+        """Points on the surface, uniform by area.
+
+        Args:
+            n: how many.
+            generator: CPU generator; torch's global one without.
+
+        Returns:
+            (n, 3) float64, world frame; (0, 3) for an empty hull.
+        """
+        if not self.voxels:
+            return torch.zeros(0, 3, dtype=torch.float64)
+        vertices, faces = self.to_mesh()
+        cumulative = np.cumsum(self._areas())
+        draw = torch.rand(n, 3, generator=generator, dtype=torch.float64).numpy()
+        chosen = np.searchsorted(cumulative, draw[:, 0] * cumulative[-1], side="right")
+        corners = vertices[faces[np.minimum(chosen, len(faces) - 1)]]
+        root = np.sqrt(draw[:, 1])
+        weights = np.stack([1 - root, root * (1 - draw[:, 2]), root * draw[:, 2]], -1)
+        return torch.from_numpy((weights[..., None] * corners).sum(1))
+
+    def sample_inside(self, n: int, generator: Generator | None = None) -> Tensor:
+        """Points inside, uniform by volume: (n, 3) float64, world frame; (0, 3) for an empty hull."""
+        if not self.voxels:
+            return torch.zeros(0, 3, dtype=torch.float64)
+        occupied = self._once("indices", lambda: np.flatnonzero(self.occupancy))
+        chosen = torch.randint(len(occupied), (n,), generator=generator).numpy()
+        within = torch.rand(n, 3, generator=generator, dtype=torch.float64).numpy()
+        index = np.stack(np.unravel_index(occupied[chosen], self.shape), -1)
+        return torch.from_numpy(self.bounds[0] + (index + within) * self.voxel_edges)
+
+    def save(self, path: str | Path) -> None:
+        """Writes a compressed .npz; the file appears whole or not at all."""
+        packed = np.packbits(self.occupancy)
+        header = {
+            "schema": _SCHEMA,
+            "shape": self.shape,
+            "bounds": self.bounds.tolist(),
+            "summary": self.summary,
+        }
+        text = np.frombuffer(json.dumps(header).encode(), np.uint8)
+        write_whole(path, lambda file: np.savez_compressed(file, header=text, occupancy=packed))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Hull:
+        """Reads what `save` wrote.
+
+        Raises:
+            CheckpointError: when the file is missing, damaged or of another kind or version.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                header = json.loads(file["header"].tobytes())
+                packed = file["occupancy"]
+            if header["schema"] != _SCHEMA:
+                raise CheckpointError(
+                    f"hull file of version {header['schema']}, this program reads {_SCHEMA}",
+                    where=path,
+                    todo="carve the hull again",
+                )
+            shape, count = tuple(header["shape"]), int(np.prod(header["shape"]))
+            if len(shape) != 3 or len(packed) != (count + 7) // 8:
+                raise ValueError("size of the grid")
+            occupancy = np.unpackbits(packed, count=count).view(bool).reshape(shape)
+            return cls.from_grid(occupancy, header["bounds"], header["summary"])
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, ConfigError) as error:
+            missing = isinstance(error, FileNotFoundError)
+            raise CheckpointError(
+                "there is no such hull file" if missing else "this is not a hull file, or it is damaged",
+                where=path,
+                todo="carve the hull again and save it with Hull.save",
+            ) from error
+
+    def write_ply(self, path: str | Path) -> None:
+        """Writes the mesh as binary PLY (float32 vertices, world frame); the file appears whole or not at all."""
+        vertices, faces = self.to_mesh()
+        records = np.empty(len(faces), np.dtype([("count", "u1"), ("index", "<i4", 3)]))
+        records["count"], records["index"] = 3, faces
+        header = (
+            "ply\nformat binary_little_endian 1.0\n"
+            f"element vertex {len(vertices)}\n" + "".join(f"property float {a}\n" for a in "xyz")
+            + f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        )  # fmt: skip
+        write_whole(
+            path, lambda f: f.write(header.encode() + vertices.astype("<f4").tobytes() + records.tobytes())
+        )
+
+
+def write_whole(path: str | Path, write: Callable[[Any], Any]) -> None:
+    """Lets `write` fill a temporary file beside `path`, then renames it, so that readers never see a part."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            write(file)
+        # mkstemp makes files private; a result is as readable as any other file.
+        umask = os.umask(0)
+        os.umask(umask)
+        Path(name).chmod(0o666 & ~umask)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _occupied_box(occupancy: np.ndarray) -> np.ndarray:
+    """(2, 3) int: first and one past the last occupied index per axis; the whole grid where it is empty."""
+    plane = occupancy.any(0)
+    if not plane.any():
+        return np.array([[0, 0, 0], occupancy.shape])
+    lines = [occupancy.any((1, 2)), plane.any(1), plane.any(0)]
+    return np.array([[line.argmax() for line in lines], [len(line) - line[::-1].argmax() for line in lines]])

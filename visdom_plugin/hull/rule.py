@@ -1,0 +1,63 @@
+"""The keep rule: which pairs of vote counts leave a voxel in the hull. Exact, in integers."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import NamedTuple
+
+
+class KeepRule(NamedTuple):
+    """Keep when the votes agree and enough views see the voxel."""
+
+    views: int
+    """N, the number of views that vote."""
+    least_visible: int
+    """K, the fewest views that must see the voxel; 1 for the traditional hull; 0 for `least_occupied`."""
+    agreement: Fraction | None
+    """n_occ >= agreement * n_vis, a fraction in (0, 1]; None when another test takes its place."""
+    max_misses: int | None = None
+    """n_vis - n_occ <= max_misses, in place of the agreement."""
+    least_occupied: int | None = None
+    """n_occ >= this, in place of both: GaussianObject's released rule, with no count of visibility."""
+
+    def keeps(self, visible: int, occupied: int) -> bool:
+        """Whether a voxel seen by `visible` views and inside the mask of `occupied` of them stays."""
+        if self.least_occupied is not None:
+            return occupied >= self.least_occupied
+        if visible < self.least_visible:
+            return False
+        if self.max_misses is not None:
+            return visible - occupied <= self.max_misses
+        return occupied * self.agreement.denominator >= self.agreement.numerator * visible
+
+    def table(self):
+        """(N + 1, N + 1) uint8 array: entry [n_vis, n_occ] is 1 where the voxel stays."""
+        import numpy as np
+
+        table = np.zeros((self.views + 1, self.views + 1), np.uint8)
+        for visible in range(self.views + 1):
+            for occupied in range(visible + 1):
+                table[visible, occupied] = self.keeps(visible, occupied)
+        return table
+
+    def meaning(self) -> str:
+        """The rule in words, at this number of views."""
+        n = self.views
+        if self.least_occupied is not None:
+            return f"inside at least {self.least_occupied} of {n} masks; views that do not see a voxel count as misses"
+        misses = [
+            next(m for m in range(v, -1, -1) if self.keeps(v, v - m))
+            for v in range(self.least_visible, n + 1)
+        ]
+        said = (
+            f"max_misses {self.max_misses}" if self.max_misses is not None else f"{float(self.agreement):g}"
+        )
+        if not misses:
+            return f"{said} of at least {self.least_visible} views, but there are only {n}"
+        allowed = {0: "not one miss is", 1: "one miss is"}.get(misses[-1], f"{misses[-1]} misses are")
+        return f"{said} of up to {n} views: {allowed} allowed"
+
+
+def as_fraction(agreement: float) -> Fraction:
+    """The decimal as it is written: 0.95 means 19/20, not the nearest binary number."""
+    return Fraction(str(agreement))
