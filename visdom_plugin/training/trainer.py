@@ -83,7 +83,7 @@ class Trainer:
                 due = (self.step + 1) % log_every == 0 or self.step + 1 == total
                 save = began - saved >= self.checkpoint_seconds or self.step + 1 == total or self.stopped
                 if due or save or (self.step + 1) % check_every == 0:
-                    loss = float(whole)
+                    loss = float(whole.detach())
                     if not abs(loss) < float("inf"):
                         self._fail(losses)
                 whole.backward()
@@ -93,7 +93,7 @@ class Trainer:
                 if due:
                     psnr = self._measure_psnr(log_every)
                     row = {"step": self.step, "loss": loss}
-                    row |= {f"loss_{k}": float(v) for k, v in losses.items()}
+                    row |= {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
                     self.run_dir.log(row | {"psnr": psnr, "train_s": round(self.train_s, 3)})
                 if save:
                     self._save()
@@ -130,7 +130,7 @@ class Trainer:
         return value if value == value and value != float("inf") else None
 
     def _fail(self, losses: dict[str, Any]) -> None:
-        parts = ", ".join(f"{name} {float(value):.4g}" for name, value in losses.items())
+        parts = ", ".join(f"{name} {float(value.detach()):.4g}" for name, value in losses.items())
         raise TrainingError(
             f"the loss is no longer a finite number at step {self.step} ({parts})",
             where=self.run_dir.path,

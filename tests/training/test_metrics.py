@@ -1,0 +1,124 @@
+"""Metrics agree with scikit-image and torchmetrics, and obey what their definitions imply."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from visdom_plugin.training import metrics
+
+
+@pytest.fixture
+def pair():
+    draw = torch.Generator().manual_seed(0)
+    y = torch.nn.functional.interpolate(torch.rand(1, 3, 9, 11, generator=draw), (45, 52), mode="bicubic")[0]
+    y = y.permute(1, 2, 0)
+    x = y + 0.1 * torch.randn(45, 52, 3, generator=draw) * torch.tensor([0.3, 1.0, 2.0])
+    return metrics.quantise(x), metrics.quantise(y)
+
+
+def test_psnr_agrees_with_scikit_image_and_torchmetrics(pair):
+    from skimage.metrics import peak_signal_noise_ratio
+    from torchmetrics.functional.image import peak_signal_noise_ratio as theirs
+
+    x, y = pair
+    assert metrics.psnr(x, y) == pytest.approx(
+        peak_signal_noise_ratio(y.numpy(), x.numpy(), data_range=1), abs=1e-9
+    )
+    assert metrics.psnr(x, y) == pytest.approx(float(theirs(x, y, data_range=1.0)), abs=1e-4)
+
+
+def test_ssim_agrees_with_scikit_image(pair):
+    ssim = pytest.importorskip("visdom_plugin.ssim").ssim
+    from skimage.metrics import structural_similarity
+
+    x, y = pair
+    # scikit-image mirrors at the border where 3DGS pads with zeros: a black frame wider than the window makes
+    # the two the same.
+    wide = [torch.nn.functional.pad(i, (0, 0, 11, 11, 11, 11)).numpy() for i in (x, y)]
+    settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "full": True}
+    _, theirs = structural_similarity(*wide, data_range=1, channel_axis=2, **settings)
+    assert float(ssim(x.float(), y.float())) == pytest.approx(theirs[11:-11, 11:-11].mean(), abs=1e-5)
+
+
+def test_per_channel_psnr_is_never_below_global_and_equal_for_equal_channels(pair):
+    x, y = pair
+    assert metrics.psnr_per_channel(x, y) > metrics.psnr(x, y)
+    grey = [i.mean(-1, keepdim=True).expand(-1, -1, 3) for i in (x, y)]
+    assert metrics.psnr_per_channel(*grey) == pytest.approx(metrics.psnr(*grey), abs=1e-9)
+
+
+def test_foreground_psnr_sees_the_mask_alone(pair):
+    x, y = pair
+    mask = torch.zeros(x.shape[:2], dtype=torch.bool)
+    mask[10:30, 5:40] = True
+    cut = metrics.psnr(x[10:30, 5:40], y[10:30, 5:40])
+    noisy = torch.where(mask[..., None], x, 1 - x)
+    assert (
+        metrics.psnr_foreground(x, y, mask) == metrics.psnr_foreground(noisy, y, mask) == pytest.approx(cut)
+    )
+    assert math.isnan(metrics.psnr_foreground(x, y, torch.zeros_like(mask)))
+
+
+def test_quantised_images_are_what_an_8_bit_file_holds():
+    x = torch.tensor([-0.3, 0.0, 0.4999 / 255, 0.5001 / 255, 0.699, 1.0, 1.2])
+    assert (metrics.quantise(x) * 255).tolist() == [0, 0, 0, 1, 178, 255, 255]
+    assert torch.equal(metrics.quantise(metrics.quantise(x)), metrics.quantise(x))
+
+
+def test_the_photographs_background_does_not_count(pair):
+    image = (pair[1] * 255).to(torch.uint8)
+    mask = torch.rand(image.shape[:2], generator=torch.Generator().manual_seed(1)) < 0.5
+    other = torch.where(mask[..., None], image, 255 - image)
+    assert torch.equal(metrics.whiten(image, mask), metrics.whiten(other, mask))
+    assert bool((metrics.whiten(image, mask)[~mask] == 1).all())
+
+
+def test_iou_and_outside_mass_of_overlapping_squares():
+    alpha, mask = torch.zeros(20, 20), torch.zeros(20, 20, dtype=torch.bool)
+    assert metrics.silhouette_iou(alpha, mask) == 1 and metrics.outside_hull_mass(alpha, mask) == 0
+    alpha[0:10, 0:10], mask[0:10, 5:15] = 0.8, True
+    assert metrics.silhouette_iou(alpha, mask) == pytest.approx(50 / 150)
+    assert metrics.outside_hull_mass(alpha, mask) == pytest.approx(0.5)
+    alpha[0:10, 5:10] = 0.4
+    assert metrics.silhouette_iou(alpha, mask) == 0
+    assert metrics.outside_hull_mass(alpha, mask) == pytest.approx(2 / 3)
+    assert metrics.outside_hull_mass(alpha, alpha > 0) == 0
+
+
+def test_means_skip_views_where_a_metric_is_undefined():
+    row = dict.fromkeys(metrics.NAMES, 1.0)
+    means = metrics.mean_over_views(
+        [row, row | {"psnr": 4.0, "psnr_foreground": math.nan, "lpips": math.nan}]
+    )
+    assert means["psnr"] == 2.5 and means["psnr_foreground"] == 1 and means["lpips"] == 1
+    assert math.isnan(metrics.mean_over_views([row | {"lpips": math.nan}])["lpips"])
+
+
+def test_lpips_hands_the_network_its_own_range(pair):
+    seen = []
+
+    def network(a, b):
+        seen.extend((a, b))
+        return (a - b).abs().mean()[None, None, None, None]
+
+    value = metrics.lpips(network, *pair)
+    assert [tuple(i.shape) for i in seen] == [(1, 3, 45, 52)] * 2
+    assert value == pytest.approx(2 * float((pair[0] - pair[1]).abs().mean()), rel=1e-5)
+    assert torch.allclose(seen[1][0].permute(1, 2, 0).double(), 2 * pair[1] - 1, atol=1e-6)
+
+
+def test_lpips_without_weights_says_so_and_downloads_nothing(monkeypatch, tmp_path, caplog):
+    import sys
+    from types import SimpleNamespace
+
+    built = []
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=lambda **k: built.append(k)))
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    assert metrics.load_lpips() is None and not built
+    assert "weights are not at" in caplog.text and "visdom-eval" in caplog.text
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    caplog.clear()
+    assert metrics.load_lpips() is None and not caplog.text
