@@ -24,14 +24,16 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
         2 for a user's mistake (the message is on stderr, without traceback), 130 when interrupted.
         Any other exception goes on, with a line that calls it a bug.
     """
-    set_up_logging()
+    words = list(sys.argv[1:] if argv is None else argv)
+    set_up_logging(quiet="--quiet" in words)
     try:
-        return command(list(sys.argv[1:] if argv is None else argv)) or 0
+        return command(words) or 0
     except VisDomError as error:
         print(f"error: {error}", file=sys.stderr)
         return USER_ERROR
-    except KeyboardInterrupt as signal:
-        resumable = type(signal).__name__ == "Interrupted"
+    except KeyboardInterrupt as stop:
+        # By name, because importing the class would import torch.
+        resumable = type(stop).__name__ == "Interrupted"
         print(
             "interrupted" + ("; the same command resumes" if resumable else ""), file=sys.stderr, flush=True
         )

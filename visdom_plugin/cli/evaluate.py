@@ -6,7 +6,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
+
+import tyro
 
 from visdom_plugin.cli import errors
 
@@ -15,7 +17,7 @@ from visdom_plugin.cli import errors
 class Options:
     """Renders the test views of a run from its last checkpoint and measures them again."""
 
-    run: Path
+    run: tyro.conf.Positional[Path]
     """Run directory, as visdom-train names it."""
     data: Path | None = None
     """Where the scene is now, if it has moved."""
@@ -31,14 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _evaluate(argv: Sequence[str]) -> None:
-    import tyro
-
-    options = tyro.cli(
-        Annotated[Options, tyro.conf.configure(tyro.conf.PositionalRequiredArgs)],
-        args=argv,
-        prog="visdom-eval",
-    )
-    errors.set_up_logging(options.quiet)
+    options = tyro.cli(Options, args=argv, prog="visdom-eval")
 
     from visdom_plugin.cli.report import say, show_result
     from visdom_plugin.cli.scenes import open_run

@@ -6,7 +6,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
+
+import tyro
 
 from visdom_plugin.cli import errors
 from visdom_plugin.errors import ConfigError
@@ -16,7 +18,7 @@ from visdom_plugin.errors import ConfigError
 class Options:
     """Renders a run from its last checkpoint along a camera path, on white."""
 
-    run: Path
+    run: tyro.conf.Positional[Path]
     """Run directory, as visdom-train names it."""
     path: Literal["orbit", "between", "train", "test"] = "orbit"
     """orbit: a circle round the object; between: from training view to training view; train, test: these views."""
@@ -42,14 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _render(argv: Sequence[str]) -> None:
-    import tyro
-
-    options = tyro.cli(
-        Annotated[Options, tyro.conf.configure(tyro.conf.PositionalRequiredArgs)],
-        args=argv,
-        prog="visdom-render",
-    )
-    errors.set_up_logging(options.quiet)
+    options = tyro.cli(Options, args=argv, prog="visdom-render")
     for name in ("frames", "fps"):
         if getattr(options, name) < 1:
             raise ConfigError(f"--{name} is {getattr(options, name)}; it must be at least 1")

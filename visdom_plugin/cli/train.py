@@ -18,7 +18,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _train(argv: Sequence[str]) -> None:
     request = options.parse(argv)
     common = request.common
-    errors.set_up_logging(common.quiet)
     if common.show_config:
         sys.stdout.write(options.dump(request))
         return
@@ -59,6 +58,8 @@ def _train(argv: Sequence[str]) -> None:
     if not common.quiet:
         if record["already_finished"]:
             say("this run is finished already; nothing was done (train again with --overwrite)")
+        elif record["resumed_from"] is not None:
+            say(f"resumed after step {record['resumed_from']}")
         show_result(record, folder)
 
 

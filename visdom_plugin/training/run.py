@@ -30,7 +30,7 @@ DataManager = Callable[[Views, int, torch.device], Any]
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal stopped the run; its state is saved."""
+    """A signal stopped the run; the same command goes on from the last step saved."""
 
 
 def train(
@@ -64,7 +64,7 @@ def train(
         CheckpointError: when `run_dir` belongs to another run or another process.
         EmptyHullError: when the config's hull is empty.
         TrainingError: when the optimisation diverges.
-        Interrupted: after Ctrl-C or SIGTERM, with the state saved.
+        Interrupted: after Ctrl-C or SIGTERM; the same call goes on from there.
     """
     preset = registry.find(preset_name)
     device = torch.device(device)
@@ -90,7 +90,7 @@ def train(
             _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds)
         except KeyboardInterrupt:
             run.update(status="interrupted")
-            raise
+            raise Interrupted from None
         except BaseException as error:
             run.update(status="failed", error=f"{type(error).__name__}: {error}")
             raise
