@@ -16,6 +16,7 @@ from typing import NoReturn
 
 import torch
 
+from datamodules.images import MAX_PIXELS
 from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import SceneError
 from visdom_plugin.rotations import matrix_from_quaternion
@@ -28,8 +29,8 @@ MODELS = {
     12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4),
     16: ("EUCM", 6), 17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
+FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _DISTORTED = {name for name, _ in MODELS.values()} - {"SIMPLE_PINHOLE", "PINHOLE"}
-_MAX_PIXELS = 2**28
 _UNDISTORT = "undistort: colmap image_undistorter --image_path images --input_path sparse/0 --output_path DIR"
 
 
@@ -144,7 +145,7 @@ def _pinhole(lens: Intrinsics, name: str, folder: Path) -> list[list[float]]:
         fy = fx
     else:
         fx, fy, cx, cy = lens.params
-    size_ok = lens.width > 0 and lens.height > 0 and lens.width * lens.height <= _MAX_PIXELS
+    size_ok = lens.width > 0 and lens.height > 0 and lens.width * lens.height <= MAX_PIXELS
     if not size_ok or not all(map(math.isfinite, lens.params)) or min(fx, fy) <= 0:
         raise SceneError(
             f"the camera of image {name} is impossible: {lens.width} x {lens.height} pixels, focal lengths "

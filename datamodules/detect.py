@@ -41,13 +41,13 @@ def load(
         return make_scene(
             SyntheticConfig(downscale=downscale, seed=seed, **wanted, **({} if test else {"test_views": 0}))
         )
-    root = Path(path).expanduser()
+    root = Path(path)
     try:
-        is_folder = root.is_dir()
-    except (OSError, ValueError):
-        is_folder = False
+        root = root.expanduser()
+        exists, is_folder = root.exists(), root.is_dir()
+    except (OSError, ValueError, RuntimeError):
+        exists = is_folder = False
     if not is_folder:
-        exists = root.exists()
         raise SceneError(
             "this is a file, not a folder" if exists else "there is no such folder",
             where=root,

@@ -16,6 +16,7 @@ import numpy as np
 
 from visdom_plugin.errors import SceneError
 
+MAX_PIXELS = 2**28
 _PNG = b"\x89PNG\r\n\x1a\n"
 # Start-of-frame markers of JPEG: all of 0xC0..0xCF but DHT (C4), JPG (C8) and DAC (CC).
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -34,7 +35,11 @@ def read_file(path: Path) -> bytes:
             "an image file is missing", where=path, todo="copy it there, or take the view off the index files"
         ) from None
     except OSError as error:
-        raise SceneError(f"an image file cannot be read: {error.strerror}", where=path) from error
+        raise SceneError(
+            f"an image file cannot be read: {error.strerror}",
+            where=path,
+            todo="make it a plain file that you may read",
+        ) from error
 
 
 def size_of(data: bytes, path: Path) -> tuple[int, int]:
@@ -43,10 +48,11 @@ def size_of(data: bytes, path: Path) -> tuple[int, int]:
     Raises:
         SceneError: another format, a damaged header or chunk, or a file that stops before its end.
     """
-    if data.startswith(_PNG):
-        return _png_size(data, path)
-    if data.startswith(b"\xff\xd8"):
-        return _jpeg_size(data, path)
+    if data.startswith((_PNG, b"\xff\xd8")):
+        width, height = (_png_size if data.startswith(_PNG) else _jpeg_size)(data, path)
+        if not 0 < width * height <= MAX_PIXELS:
+            _damaged(path, f"the image claims to be {width} x {height}")
+        return width, height
     raise SceneError(
         "the file is neither PNG nor JPEG" if data else "the file is empty",
         where=path,

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from datamodules import colmap, images, splits
+from datamodules.paths import check_name, inside
 from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.scene import Scene, Views
@@ -78,7 +79,9 @@ def load_prepared(root: Path, *, views: int | None, downscale: float, test: bool
     """
     if not (math.isfinite(downscale) and downscale >= 1):
         raise ConfigError(f"downscale is {downscale:g}; it must be 1 or more", where="--downscale")
-    model = colmap.read_model(_inside(root, "sparse/0"))
+    for name in colmap.FILES:
+        inside(root, f"sparse/0/{name}")
+    model = colmap.read_model(root / "sparse" / "0")
     registered = _sorted_images(model)
     train_index, test_index, index_files = splits.read_splits(root, views, len(registered), test=test)
     train, tested = [registered[i] for i in train_index], [registered[i] for i in test_index]
@@ -126,47 +129,13 @@ def hash_views(views: Views) -> dict[str, str]:
     return hashes | ({"mono_depths": digest(views.mono_depths)} if views.mono_depths else {})
 
 
-def _check_name(relative: str, where: Path) -> None:
-    """Refuses names in the data that are absolute, climb out of their folder, or hold control characters."""
-    parts = relative.replace("\\", "/").split("/")
-    drive = len(parts[0]) == 2 and parts[0].endswith(":")
-    if not relative.isprintable() or drive or parts[0] == "" or ".." in parts:
-        raise SceneError(
-            f"the data names a file outside its folder: {relative[:80]!r}",
-            where=where,
-            todo="name each image in the model by its path below the image folder",
-        )
-
-
-def _inside(root: Path, relative: str) -> Path:
-    """A path below `root` that really lies there.
-
-    Raises:
-        SceneError: the name leads out of the folder by itself or through a symbolic link.
-    """
-    _check_name(relative, root)
-    path = root / relative
-    try:
-        real, base = path.resolve(), root.resolve()
-    except (OSError, RuntimeError) as error:
-        raise SceneError(f"the path cannot be followed: {error}", where=path) from error
-    if not real.is_relative_to(base):
-        raise SceneError(
-            "a symbolic link leads out of the scene's folder",
-            where=f"{path} -> {real}",
-            cause="files outside the data folder are never read",
-            todo="copy the file into the folder, or link inside it only",
-        )
-    return path
-
-
 def _stem(name: str) -> str:
     return str(PurePosixPath(name).with_suffix(""))
 
 
 def _sorted_images(model: colmap.Model) -> list[colmap.Registered]:
     for image in model.images:
-        _check_name(image.name, model.folder)
+        check_name(image.name, model.folder)
     ordered = sorted(model.images, key=lambda image: _stem(image.name))
     for one, two in pairwise(ordered):
         if _stem(one.name) == _stem(two.name):
@@ -181,9 +150,9 @@ def _sorted_images(model: colmap.Model) -> list[colmap.Registered]:
 
 def _image_folder(root: Path, downscale: float) -> _Folder:
     smaller = f"images_{downscale:g}"
-    if downscale > 1 and _inside(root, smaller).is_dir():
+    if downscale > 1 and inside(root, smaller).is_dir():
         return _Folder(root, root / smaller, downscale, downscale)
-    if _inside(root, "images").is_dir():
+    if inside(root, "images").is_dir():
         return _Folder(root, root / "images", 1.0, downscale)
     others = sorted(p.name for p in root.glob("images_*") if p.is_dir())
     raise SceneError(
@@ -196,7 +165,7 @@ def _image_folder(root: Path, downscale: float) -> _Folder:
 
 
 def _check_masks(root: Path, registered: Sequence[colmap.Registered], wanted) -> None:
-    folder = _inside(root, "masks")
+    folder = inside(root, "masks")
     if not folder.is_dir():
         raise SceneError(
             "the folder masks is missing",
@@ -241,7 +210,7 @@ def _some(names: Sequence[str]) -> str:
 def _read_views(folder: _Folder, wanted: Sequence[colmap.Registered], cameras: Cameras) -> list[_View]:
     import cv2
 
-    depths = _inside(folder.root, "zoe_depth")
+    depths = inside(folder.root, "zoe_depth")
     full = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
 
     def read(i: int) -> _View:
@@ -255,7 +224,7 @@ def _read_views(folder: _Folder, wanted: Sequence[colmap.Registered], cameras: C
 
 
 def _read_view(folder: _Folder, name: str, full: tuple[int, int], depths: Path | None) -> _View:
-    path = _inside(folder.root, f"{folder.images.name}/{name}")
+    path = inside(folder.root, f"{folder.images.name}/{name}")
     data = images.read_file(path)
     size = images.size_of(data, path)
     factor = folder.factor
@@ -275,7 +244,7 @@ def _read_view(folder: _Folder, name: str, full: tuple[int, int], depths: Path |
     image = images.shrink(images.decode_photograph(data, path), *target)
     mask = _read_mask(folder, name, full, size, target)
     depth = None
-    if depths is not None and (path := _inside(folder.root, f"zoe_depth/{_stem(name)}.png")).is_file():
+    if depths is not None and (path := inside(folder.root, f"zoe_depth/{_stem(name)}.png")).is_file():
         data = images.read_file(path)
         _check_shape(images.size_of(data, path), full, path, "depth map")
         depth = torch.from_numpy(images.shrink_nearest(images.decode_depth(data, path), *target))
@@ -283,7 +252,7 @@ def _read_view(folder: _Folder, name: str, full: tuple[int, int], depths: Path |
 
 
 def _read_mask(folder: _Folder, name: str, full, size, target) -> np.ndarray:
-    path = _inside(folder.root, f"masks/{_stem(name)}.png")
+    path = inside(folder.root, f"masks/{_stem(name)}.png")
     data = images.read_file(path)
     mask_size = images.size_of(data, path)
     if mask_size not in (full, size):

@@ -49,8 +49,8 @@ _TRAIN = (
 class SyntheticConfig:
     """The built-in scene's knobs. Noise goes to the training views only; test views stay exact."""
 
-    size: tuple[int, int] = (200, 200)
-    """Width and height of the photographs in pixels, before `downscale`."""
+    size: int | tuple[int, int] = 200
+    """Width and height of the photographs in pixels before `downscale`; one number for a square."""
     train_views: int = 4
     """2 to 16; fewer views are the first of more."""
     test_views: int = 16
@@ -75,13 +75,25 @@ class SyntheticConfig:
     seed: int = 0
     """Of the noise."""
 
+    @property
+    def frame(self) -> tuple[int, int]:
+        """Width and height in pixels, after `downscale`."""
+        size = (self.size, self.size) if isinstance(self.size, int) else self.size
+        width, height = (max(1, round(s / self.downscale)) for s in size)
+        return width, height
+
     def check(self) -> None:
         """Raises ConfigError for a field out of its range."""
+        downscale_fine = math.isfinite(self.downscale) and self.downscale >= 1
         checks = (
-            ("size", min(self.size) >= 8 and max(self.size) <= 8192, "8 to 8192 pixels"),
+            ("downscale", downscale_fine, "1 or more"),
+            (
+                "size",
+                not downscale_fine or 8 <= min(self.frame) <= max(self.frame) <= 8192,
+                "8 to 8192 pixels",
+            ),
             ("train_views", 2 <= self.train_views <= _MOST_VIEWS, f"2 to {_MOST_VIEWS}"),
             ("test_views", 0 <= self.test_views <= 360, "0 to 360"),
-            ("downscale", 1 <= self.downscale <= min(self.size) / 8, "1 to a picture of 8 pixels"),
             ("rotation_noise_deg", 0 <= self.rotation_noise_deg <= 180, "0 to 180"),
             ("translation_noise", 0 <= self.translation_noise <= 1, "0 to 1"),
             ("erode_px", 0 <= self.erode_px <= 1000, "0 to 1000"),
@@ -190,7 +202,7 @@ def _camera(config: SyntheticConfig, row: tuple):
     straight = look_at_camera(centre, middle, vertical)
     half = _SCALE * distance * math.tan(math.radians(view) / 2)
     aim = middle + half * (right * straight[:3, 0] - up * straight[:3, 1])
-    width, height = (max(1, round(s / config.downscale)) for s in config.size)
+    width, height = config.frame
     focal = 0.5 * min(width, height) / math.tan(math.radians(view) / 2)
     K = [[focal, 0, width * (0.5 + shift_x)], [0, focal, height * (0.5 + shift_y)], [0, 0, 1]]
     return Cameras.from_matrices(
