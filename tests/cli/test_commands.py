@@ -234,3 +234,15 @@ def test_help_lists_the_built_in_methods_and_imports_nothing_heavy():
     assert done.returncode == 0, done.stderr
     for name in ("method:3dgs-go:", "method:3dgs-go+mask:", "method:3dgs-go+vd:", "--method.hull.k"):
         assert name in done.stdout, name
+
+
+def test_a_full_disk_is_not_called_a_bug(capsys):
+    import errno
+    import os
+
+    def full(argv):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/log.jsonl")
+
+    assert errors.run(full, []) == 2
+    err = capsys.readouterr().err
+    assert "No space left" in err and "run/log.jsonl" in err and "bug" not in err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import sys
 from collections.abc import Callable, Sequence
@@ -9,8 +10,10 @@ from collections.abc import Callable, Sequence
 from visdom_plugin.errors import VisDomError
 
 USER_ERROR, INTERRUPTED = 2, 130
+BUG = "this is a bug in visdom-plugin or in a plugin; please report it with:"
 
-log = logging.getLogger(__name__)
+_OUTSIDE = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
+"""Faults of the disk, not of the program: full, over quota, not allowed, read-only."""
 
 
 def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None = None) -> int:
@@ -42,8 +45,17 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
         # The reader went away, as in `visdom-methods | head`.
         sys.stderr.close()
         return 0
+    except OSError as error:
+        if error.errno not in _OUTSIDE:
+            print(BUG, file=sys.stderr)
+            raise
+        print(
+            f"error: {error}\n  what to do: make room or choose another place, then run it again",
+            file=sys.stderr,
+        )
+        return USER_ERROR
     except Exception:
-        print("this is a bug in visdom-plugin or in a plugin; please report it with:", file=sys.stderr)
+        print(BUG, file=sys.stderr)
         raise
 
 

@@ -85,9 +85,8 @@ def train(
             threads=torch.get_num_threads(),
             budget=budget,
         )
-        resumed = max(checkpoints.list_steps(run.path / "checkpoints"), default=None)
         try:
-            _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds)
+            resumed = _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds)
         except KeyboardInterrupt:
             run.update(status="interrupted")
             raise Interrupted from None
@@ -97,7 +96,7 @@ def train(
         return run.record | {"resumed_from": resumed, "already_finished": False}
 
 
-def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds) -> None:
+def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds):
     method, hull, hull_s = build(preset, config, scene.train, device=device, seed=seed)
     if hull is not None:
         write_hull(hull, run.path / "hull")
@@ -124,6 +123,7 @@ def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoi
         timing={"hull_s": hull_s, "train_s": trainer.train_s, "eval_s": eval_s, "step_ms": step_ms},
         metrics=finite(found),
     )
+    return trainer.resumed_from
 
 
 def build(
@@ -194,22 +194,7 @@ def write_hull(hull: Any, folder: Path) -> None:
             hull.save(part)
     if not (folder / "hull.ply").exists():
         with appearing(folder / "hull.ply") as part:
-            write_mesh(part, *hull.to_mesh())
-
-
-def write_mesh(path: Path, vertices: Any, faces: Any) -> None:
-    """A triangle mesh as binary PLY."""
-    import numpy as np
-
-    vertices, faces = np.asarray(vertices, "<f4"), np.asarray(faces, "<i4")
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
-    rows["count"], rows["corners"] = 3, faces
-    Path(path).write_bytes(header.encode() + vertices.tobytes() + rows.tobytes())
+            hull.write_ply(part)
 
 
 def export(method: Method, folder: Path) -> list[Path]:

@@ -59,6 +59,7 @@ class Trainer:
         self.folder = run.path / "checkpoints"
         self.step, self.train_s = 0, 0.0
         self.stopped = False
+        self.resumed_from: int | None = None
 
     def run(self) -> bool:
         """Trains to the end; False when a signal asked it to stop (the state is saved then).
@@ -108,7 +109,8 @@ class Trainer:
         found = checkpoints.load_newest(self.folder)
         if found is not None:
             self.method.load_state_dict(found.tensors)
-            self.step, self.train_s = found.step, float(found.notes.get("train_s", 0))
+            self.step = self.resumed_from = found.step
+            self.train_s = float(found.notes.get("train_s", 0))
         for step in checkpoints.list_steps(self.folder):
             if found is None or step > found.step:
                 checkpoints.remove(self.folder, step)
