@@ -86,6 +86,7 @@ def test_a_file_appears_whole_or_the_old_one_stays(tmp_path):
         raise RuntimeError
     assert path.read_bytes() == before and [p.name for p in path.parent.iterdir()] == ["x.json"]
     (path.parent / f"{MARK}left").write_text("by a killed process")
+    (path.parent / f".{MARK}left.tmp").write_text("by a writer inside")
     (tmp_path / f"{MARK}folder").mkdir()
     remove_parts(tmp_path)
     assert [p.name for p in tmp_path.rglob("*")] == ["deep", "x.json"]

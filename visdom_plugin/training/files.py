@@ -59,7 +59,8 @@ def finite(value: Any) -> Any:
 
 def remove_parts(folder: Path) -> None:
     """Removes what a killed process left half-written, at any depth."""
-    for part in list(folder.rglob(f"{MARK}*")):
+    # With a second dot: writers that make a temporary file of their own beside the one they were given.
+    for part in [*folder.rglob(f"{MARK}*"), *folder.rglob(f".{MARK}*")]:
         if part.is_dir() and not part.is_symlink():
             shutil.rmtree(part)
         else:
