@@ -38,7 +38,10 @@ def _sum_areas(pixels, sizes, offsets, table_offsets, tables):
 
 
 def sum_areas(silhouettes: Silhouettes) -> tuple[np.ndarray, np.ndarray]:
-    """Summed-area tables of all masks, flat int32, and where each starts. Entry (r, c) sums rows < r, columns < c."""
+    """Summed-area tables of all masks, flat int32, and where each starts.
+
+    Entry (r, c) of a table sums rows < r and columns < c.
+    """
     counts = (silhouettes.sizes + 1).prod(1)
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
     tables = np.empty(int(counts.sum()), np.int32)
@@ -125,7 +128,7 @@ def _classify(blocks, x, y, z, slack, sizes, starts, tables, table, states):
         visible, occupied, unsettled = 0, 0, 0
         for view in range(views):
             said = _judge(view, i, i + 1, j, j + 1, k, k + 1, x, y, z, slack, sizes, starts, tables)
-            visible += said == _EMPTY or said == _FULL
+            visible += said in (_EMPTY, _FULL)
             occupied += said == _FULL
             unsettled += said == _OPEN
         states[b] = _decide(table, visible, occupied, unsettled)

@@ -100,7 +100,7 @@ class Hull:
 
     @property
     def surface_area(self) -> float:
-        """Area of the mesh, square scene units. The steps between voxels make it larger than a smooth surface's."""
+        """Area of the mesh, square scene units. Voxel steps enlarge it."""
         return float(self._areas().sum())
 
     @property

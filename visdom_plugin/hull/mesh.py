@@ -29,7 +29,7 @@ def _face_corners(axis: int, side: int) -> list[int]:
 
 
 def _segments(case: int) -> dict[int, int]:
-    """Directed traces on the six faces, from edge to edge, so that loops run anticlockwise seen from outside the surface."""
+    """Directed traces on the six faces, from edge to edge; loops of them run anticlockwise from outside."""
     following = {}
     for axis, side in _FACES:
         ring = _face_corners(axis, side)
@@ -150,7 +150,7 @@ def _count_slabs(grid, counts, triangles_of, vertices_of):
 @njit(cache=True, nogil=True)
 def _number_slab(grid, i, first, ids, vertices):
     """Numbers and places the vertices that slab i owns."""
-    nx, ny, nz = grid.shape
+    _, ny, nz = grid.shape
     count = first
     for j in range(ny + 1):
         k = 0

@@ -44,7 +44,7 @@ class KeepRule(NamedTuple):
         """The rule in words, at this number of views."""
         n = self.views
         if self.least_occupied is not None:
-            return f"inside at least {self.least_occupied} of {n} masks; views that do not see a voxel count as misses"
+            return f"inside at least {self.least_occupied} of {n} masks; not seeing a voxel counts as a miss"
         misses = [
             next(m for m in range(v, -1, -1) if self.keeps(v, v - m))
             for v in range(self.least_visible, n + 1)
