@@ -81,7 +81,7 @@ def _plane(points, azimuth: float, mirror: bool = False) -> np.ndarray:
 
 
 def _smooth(points: np.ndarray, count: int) -> np.ndarray:
-    """(count, D) points spread evenly along the centripetal-free Catmull-Rom curve through (N, D) points."""
+    """(count, D) points spread evenly along the uniform Catmull-Rom curve through (N, D) points."""
     points = np.asarray(points, np.float64)
     padded = np.concatenate([2 * points[:1] - points[1:2], points, 2 * points[-1:] - points[-2:-1]])
     t = np.linspace(0, 1, 24, endpoint=False)[:, None]
