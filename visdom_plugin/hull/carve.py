@@ -1,0 +1,156 @@
+"""From cameras and masks to a Hull, as a VisibleDomain says."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visdom_plugin.cameras import Cameras
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.hull.blocks import block_carve, sum_areas
+from visdom_plugin.hull.components import choose_pieces, erase_pieces, find_pieces
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.hull import Hull
+from visdom_plugin.hull.region import Region, cube_around, find_region, grid_in
+from visdom_plugin.hull.rule import KeepRule, as_fraction
+from visdom_plugin.hull.votes import Grid, Silhouettes, dense_carve, gather_silhouettes
+
+log = logging.getLogger(__name__)
+
+
+def keep_rule(domain: VisibleDomain, views: int) -> KeepRule:
+    """The rule of a domain for a number of views; `k="auto"` must have been resolved."""
+    if domain.kind == "released-go":
+        return KeepRule(views, 0, None, least_occupied=max(views - 1, 1))
+    k = max(views - 1, 1) if domain.k == "n-1" else domain.k
+    least = k if domain.kind == "visdom" else 1
+    agreement = None if domain.max_misses is not None else as_fraction(domain.agreement)
+    return KeepRule(views, least, agreement, domain.max_misses)
+
+
+def carve(domain: VisibleDomain, cameras: Cameras, masks: Sequence) -> Hull:
+    """See `VisibleDomain.carve`."""
+    from visdom_plugin.hull.diagnose import choose_k, explain_empty
+
+    started = time.perf_counter()
+    silhouettes = gather_silhouettes(cameras, masks, domain.dilate_px)
+    asked = domain.k
+    if domain.k == "auto" and domain.kind != "released-go":
+        domain = replace(domain, k=choose_k(domain, cameras, silhouettes))
+    device = getattr(masks[0], "device", "cpu")
+    hull = carve_silhouettes(domain, cameras, silhouettes, device=device)
+    if hull is None:
+        raise explain_empty(domain, cameras, silhouettes)
+    hull.summary["k_asked"] = asked
+    hull.summary["seconds"] = round(time.perf_counter() - started, 4)
+    log.info(
+        "hull: %s, %d views; %s; %d of %s voxels of %.4g, %d of %d pieces, %.2f s",
+        domain.kind, len(silhouettes), hull.summary["agreement_means"], hull.voxels,
+        "x".join(map(str, hull.shape)), hull.voxel_size, hull.summary["components"],
+        hull.summary["components_found"], hull.summary["seconds"],
+    )  # fmt: skip
+    return hull
+
+
+def carve_silhouettes(
+    domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes, *, device="cpu"
+) -> Hull | None:
+    """The hull, or None when nothing is left."""
+    rule = keep_rule(domain, len(silhouettes))
+    areas = sum_areas(silhouettes)
+    placed = _place(domain, cameras, silhouettes, rule, areas)
+    if placed is None:
+        return None
+    grid, ball, closed = placed
+    if str(device) == "cpu":
+        occupancy = block_carve(silhouettes, grid, rule, areas)
+    else:
+        occupancy = dense_carve(silhouettes, grid, rule, device).cpu().numpy()
+    if ball is not None:
+        _clip_to_ball(occupancy, grid, *ball)
+    pieces = find_pieces(occupancy)
+    if len(pieces.sizes) == 0:
+        return None
+    keep = choose_pieces(pieces.sizes, domain.components, domain.min_component_fraction)
+    if not keep.all():
+        erase_pieces(occupancy, pieces, keep)
+    summary = {
+        "kind": domain.kind,
+        "views": len(silhouettes),
+        "k": rule.least_visible,
+        "agreement": None if rule.agreement is None else domain.agreement,
+        "max_misses": rule.max_misses,
+        "agreement_means": rule.meaning(),
+        "resolution": domain.resolution,
+        "components": int(keep.sum()),
+        "components_found": len(keep),
+        "voxels_dropped": int(pieces.sizes[~keep].sum()),
+        "bounds_closed": closed,
+        "dilate_px": domain.dilate_px,
+    }
+    if ball is not None:
+        summary |= {"sphere_centre": [float(x) for x in ball[0]], "sphere_radius": float(ball[1])}
+    return Hull(occupancy, grid.bounds, summary)
+
+
+def _place(domain: VisibleDomain, cameras, silhouettes, rule: KeepRule, areas):
+    """Grid, ball (centre, radius) or None, and whether the views close the region; None for no region."""
+    needs_ball = domain.kind == "unit-sphere"
+    given = None if domain.bounds is None else np.array(domain.bounds, np.float64)
+    ball_given = domain.sphere_centre is not None and domain.sphere_radius is not None
+    region = None
+    if given is None or (needs_ball and not ball_given):
+        drop = domain.min_component_fraction if domain.components != "all" else 0.0
+        region = _visible_region(domain, cameras, silhouettes, rule, areas, drop)
+        if region is None:
+            return None
+        if not region.closed:
+            log.warning(
+                "the views leave the hull open: it is cut off at %s; more views from other sides, a larger k or "
+                "explicit bounds would close it",
+                np.array2string(region.bounds, precision=4, separator=", "),
+            )
+    ball = None
+    if needs_ball:
+        box = None if region is None else region.bounds
+        centre = box.mean(0) if domain.sphere_centre is None else np.array(domain.sphere_centre, np.float64)
+        radius = domain.sphere_radius
+        ball = centre, float(np.linalg.norm(box[1] - box[0]) / 2) if radius is None else float(radius)
+    closed = region is None or region.closed
+    if given is not None:
+        return grid_in(given, domain.resolution), ball, True
+    box = region.bounds
+    if ball is not None:
+        box = np.stack([ball[0] - ball[1], ball[0] + ball[1]])
+    elif domain.kind == "traditional":
+        centres = cameras.centres.double().cpu().numpy()
+        box = np.stack([np.minimum(box[0], centres.min(0)), np.maximum(box[1], centres.max(0))])
+    return cube_around(box, domain.resolution), ball, closed
+
+
+def _visible_region(domain, cameras, silhouettes, rule: KeepRule, areas, drop: float) -> Region | None:
+    if domain.kind in ("visdom", "released-go"):
+        return find_region(cameras, silhouettes, rule, drop_below=drop, areas=areas)
+    views = len(silhouettes)
+    start = keep_rule(replace(domain, kind="visdom"), views).least_visible
+    for k in range(min(start, views), 0, -1):
+        region = find_region(
+            cameras, silhouettes, rule._replace(least_visible=k), drop_below=drop, areas=areas
+        )
+        if region is not None:
+            return region
+    return None
+
+
+def _clip_to_ball(occupancy: np.ndarray, grid: Grid, centre: np.ndarray, radius: float) -> None:
+    """Clears, in place, the voxels whose centres lie outside the ball."""
+    if radius <= 0:
+        raise ConfigError("the ball of unit-sphere has no extent", where="VisibleDomain.sphere_radius")
+    x, y, z = ((grid.centres(a) - centre[a]) ** 2 for a in range(3))
+    yz = y[:, None] + z
+    for i in range(len(x)):
+        occupancy[i] &= yz <= radius**2 - x[i]

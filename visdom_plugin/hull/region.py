@@ -1,0 +1,148 @@
+"""Where the hull is, from cameras and masks alone: coarse to fine, without a guess at origin or scale.
+
+The search starts in a cube around the point the cameras look at and judges whole cells, not sample points, so a
+part is never lost for being thinner than a cell. Cells that the rule may keep are split in eight.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import NamedTuple
+
+import numpy as np
+
+from visdom_plugin.cameras import Cameras, look_at_point
+from visdom_plugin.hull.blocks import DROPPED, KEPT, MIXED, classify_cells, sum_areas
+from visdom_plugin.hull.components import find_pieces
+from visdom_plugin.hull.rule import KeepRule
+from visdom_plugin.hull.votes import Grid, Silhouettes
+
+log = logging.getLogger(__name__)
+
+_START = 32
+"""Cells along a side of the first cube."""
+_FINEST = 96
+"""Cells along the found box's longest side when the search ends: its faces are known to about 1 %."""
+_MOST_CELLS = 2_000_000
+_DOUBLINGS = 4
+MARGIN_VOXELS = 2
+"""Empty voxels between the region and the faces of the grid."""
+
+
+class Region(NamedTuple):
+    """A box that holds all points the rule may keep."""
+
+    bounds: np.ndarray
+    """(2, 3) lower and upper corner, world frame."""
+    closed: bool
+    """False when the region reaches the limit of the search: the views leave it open."""
+
+
+def find_region(
+    cameras: Cameras, silhouettes: Silhouettes, rule: KeepRule, *, drop_below: float = 0.0, areas=None
+) -> Region | None:
+    """The smallest box known to hold the rule's region, or None when no point can satisfy the rule.
+
+    The first cube reaches twice as far from the look-at point as the farthest camera. While the region touches
+    its faces, or is empty, the cube is doubled, up to 16 times; a region that still touches is open, and is
+    clipped to the first cube that holds any of it.
+
+    Args:
+        drop_below: leave out pieces whose largest possible volume is below this fraction of the least possible
+            volume of the largest piece.
+        areas: from `blocks.sum_areas`.
+    """
+    areas = sum_areas(silhouettes) if areas is None else areas
+    centre = look_at_point(cameras.to("cpu", dtype=_double())).numpy()
+    reach = float((cameras.centres.double().cpu() - _tensor(centre)).norm(dim=-1).max())
+    reach = max(reach, 1e-6)
+    first = None
+    for doubling in range(_DOUBLINGS + 1):
+        half = 2.0 * reach * 2**doubling
+        start = Grid(centre - half, 2 * half / _START, (_START,) * 3)
+        found = _refine(silhouettes, areas, rule, start, drop_below)
+        if found is None:
+            continue
+        box, touches = found
+        if not touches:
+            return Region(box, True)
+        if first is None:
+            first = box
+    return None if first is None else Region(first, False)
+
+
+def _double():
+    import torch
+
+    return torch.float64
+
+
+def _tensor(array):
+    import torch
+
+    return torch.from_numpy(array)
+
+
+def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, drop_below: float):
+    """Box of the region inside one cube and whether it touches the cube's faces, or None."""
+    cells = np.stack(np.unravel_index(np.arange(np.prod(grid.shape)), grid.shape), -1)
+    settled = np.zeros((0, 3), np.int64)
+    while True:
+        states = classify_cells(silhouettes, areas, grid, rule, np.ascontiguousarray(cells))
+        settled = np.concatenate([settled, cells[states == KEPT]])
+        mixed = cells[states == MIXED]
+        if drop_below:
+            settled, mixed = _drop_small(settled, mixed, drop_below)
+        if len(settled) + len(mixed) == 0:
+            return None
+        low = np.minimum(settled.min(0, initial=1 << 40), mixed.min(0, initial=1 << 40))
+        high = np.maximum(settled.max(0, initial=-1), mixed.max(0, initial=-1)) + 1
+        if (high - low).max() >= _FINEST or 8 * len(mixed) > _MOST_CELLS or not len(mixed):
+            box = grid.lower + np.stack([low, high]) * grid.voxel
+            return box, bool((low == 0).any() or (high == np.array(grid.shape)).any())
+        grid = Grid(grid.lower, grid.voxel / 2, tuple(2 * n for n in grid.shape))
+        cells, settled = (_split(x) for x in (mixed, settled))
+
+
+def _split(cells: np.ndarray) -> np.ndarray:
+    """(8 M, 3) the eight halves of each cell."""
+    corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+    return (2 * cells[:, None] + corners).reshape(-1, 3)
+
+
+def _drop_small(settled: np.ndarray, mixed: np.ndarray, fraction: float):
+    """Leaves out pieces that cannot reach `fraction` of the largest, whatever the mixed cells turn out to be."""
+    both = np.concatenate([settled, mixed])
+    if not len(settled):
+        return settled, mixed
+    low = both.min(0)
+    grid = np.zeros(both.max(0) - low + 1, bool)
+    sure = np.zeros_like(grid)
+    grid[tuple((both - low).T)] = True
+    sure[tuple((settled - low).T)] = True
+    pieces = find_pieces(grid)
+    # Cells that are kept whole and touch are certain to be one piece.
+    least = find_pieces(sure).sizes.max(initial=0)
+    keep = pieces.sizes >= fraction * least
+    if keep.all():
+        return settled, mixed
+    from visdom_plugin.hull.components import erase_pieces
+
+    erase_pieces(grid, pieces, keep)
+    return tuple(x[grid[tuple((x - low).T)]] for x in (settled, mixed))
+
+
+def cube_around(box: np.ndarray, resolution: int) -> Grid:
+    """A cube of `resolution` voxels per side around a box, with a margin of a few voxels."""
+    side = float((box[1] - box[0]).max()) * resolution / max(resolution - 2 * MARGIN_VOXELS, 1)
+    return Grid(box.mean(0) - side / 2, side / resolution, (resolution,) * 3)
+
+
+def grid_in(bounds: np.ndarray, resolution: int) -> Grid:
+    """Cubic voxels in an explicit box, `resolution` along its longest side; short sides are rounded up."""
+    size = bounds[1] - bounds[0]
+    voxel = float(size.max()) / resolution
+    return Grid(bounds[0], voxel, tuple(int(n) for n in np.ceil(size / voxel - 1e-9).clip(1)))
+
+
+__all__ = ["DROPPED", "MARGIN_VOXELS", "Region", "cube_around", "find_region", "grid_in"]
