@@ -3,8 +3,6 @@ zero padding, images in [0, 1], as 3DGS has it."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from numba import njit

@@ -34,10 +34,28 @@ def rasterise_cpu(
         means2d.retain_grad()
     rgb, alpha, depth = _Blend.apply(means2d, splats, extents, background, width, height)
     info = {
-        "means2d": means2d, "radii": radii, "visible": (radii > 0).all(-1), "depths": splats[:, 7].detach(),
-        "width": width, "height": height,
-    }  # fmt: skip
+        "means2d": means2d,
+        "radii": radii,
+        "visible": (radii > 0).all(-1),
+        "conics": splats[:, :3].detach(),
+        "colours": splats[:, 4:7].detach(),
+        "depths": splats[:, 7].detach(),
+        "width": width,
+        "height": height,
+    }
     return Render(rgb, alpha, depth, info)
+
+
+def warm_up() -> None:
+    """Compiles every float32 kernel of a training step, or loads it from numba's cache; later calls are free."""
+    from visdom_plugin.ssim import ssim
+
+    eye = torch.eye(4, dtype=torch.float64)
+    camera = Cameras.from_matrices(eye[:3, :3] * 16, eye, width=16, height=16)
+    shapes = ((1, 3), (1, 3), (1, 4), (1,), (1, 16, 3))
+    gaussians = Gaussians(*(torch.ones(shape, requires_grad=True) for shape in shapes))
+    render = rasterise_cpu(gaussians, camera, torch.ones(3), 3, 0.01)
+    (ssim(render.rgb, torch.zeros(16, 16, 3)) + render.depth.sum()).backward()
 
 
 def _pack(camera: Cameras, near: float) -> Tensor:

@@ -43,9 +43,14 @@ def rasterise_gsplat(
     )
     radii = meta["radii"][0]
     info = {
-        "means2d": _with_gradient_of_first(meta["means2d"]), "radii": radii, "visible": (radii > 0).all(-1),
-        "depths": meta["depths"][0].detach(), "width": width, "height": height,
-    }  # fmt: skip
+        "means2d": _with_gradient_of_first(meta["means2d"]),
+        "radii": radii,
+        "visible": (radii > 0).all(-1),
+        "conics": meta["conics"][0].detach(),
+        "depths": meta["depths"][0].detach(),
+        "width": width,
+        "height": height,
+    }
     return Render(colours[0, ..., :3], alphas[0, ..., 0], colours[0, ..., 3], info)
 
 

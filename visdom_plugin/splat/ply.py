@@ -34,7 +34,7 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     path = Path(path)
     arrays = {k: v.detach().cpu().float().numpy() for k, v in gaussians.tensors().items()}
     n, sh = len(gaussians), arrays["sh"]
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, -1)
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh.shape[1] - 1))
     columns = [arrays["means"], np.zeros((n, 3)), sh[:, 0], rest, arrays["opacity_logits"][:, None]]
     columns += [arrays["log_scales"], arrays["quaternions"]]
     table = np.concatenate(columns, 1).astype("<f4")

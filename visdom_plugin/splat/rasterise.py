@@ -37,8 +37,8 @@ def rasterise(
 
     Returns:
         Render whose info holds means2d (N, 2) pixels, whose `.grad` after a backward pass is the gradient by the
-        pixel-space means; radii (N, 2) int32 pixels, 0 where not drawn; visible (N,) bool; depths (N,) camera z;
-        width and height.
+        pixel-space means; radii (N, 2) int32 pixels, 0 where not drawn; visible (N,) bool; conics (N, 3)
+        per px^2; colours (N, 3) (CPU only); depths (N,) camera z; width and height.
 
     Raises:
         ConfigError: for an unknown backend, a backend that does not fit the device, or a degree not stored.
