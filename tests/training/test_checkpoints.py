@@ -56,14 +56,21 @@ def _lose(path):
     path.unlink()
 
 
-@pytest.mark.parametrize("damage", [_cut, _flip, _lose])
-@pytest.mark.parametrize("suffix", [".safetensors", ".json"])
+@pytest.mark.parametrize(
+    ("suffix", "damage"),
+    # Not a flip in the JSON: one letter changed may leave the same JSON.
+    [
+        (".safetensors", _cut),
+        (".safetensors", _flip),
+        (".safetensors", _lose),
+        (".json", _cut),
+        (".json", _lose),
+    ],
+)
 def test_a_damaged_state_gives_way_to_the_one_before(tmp_path, damage, suffix):
     for step in (1, 2):
         checkpoints.save(tmp_path, step, _state(step), {})
     damage(tmp_path / f"step-00000002{suffix}")
-    if suffix == ".json" and damage is _flip:
-        pytest.skip("a JSON with one letter changed may still be the same JSON")
     found = checkpoints.load_newest(tmp_path)
     assert found.step == 1 and _same(found.tensors, _state(1))
     with pytest.raises(CheckpointError):

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from visdom_plugin import registry
-from visdom_plugin.errors import CheckpointError
+from visdom_plugin.errors import CheckpointError, ConfigError, EmptyHullError, PluginError, SceneError
 from visdom_plugin.scene import Scene, Views
 from visdom_plugin.training import checkpoints
 from visdom_plugin.training.evaluate import carve_reference, evaluate
@@ -90,6 +90,10 @@ def train(
         except KeyboardInterrupt:
             run.update(status="interrupted")
             raise Interrupted from None
+        except (SceneError, EmptyHullError, ConfigError, PluginError):
+            # The user's mistake, found before the first step: no trace of it.
+            run.discard()
+            raise
         except BaseException as error:
             run.update(status="failed", error=f"{type(error).__name__}: {error}")
             raise

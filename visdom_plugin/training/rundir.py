@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from visdom_plugin.errors import CheckpointError
 from visdom_plugin.scene import Scene, Views
+from visdom_plugin.training.checkpoints import list_steps
 from visdom_plugin.training.files import MARK, remove_parts, write_bytes, write_json
 from visdom_plugin.training.settings import as_plain, differences
 
@@ -82,6 +84,7 @@ class RunDir:
         self.path = Path(path)
         self.record: dict[str, Any] = {}
         self._lock = None
+        self._is_new = False
 
     @classmethod
     def open(cls, path: Path, identity: dict[str, Any], *, overwrite: bool = False) -> RunDir:
@@ -116,7 +119,8 @@ class RunDir:
             ) from error
         try:
             remove_parts(run.path)
-            if (run.path / "run.json").exists():
+            run._is_new = not (run.path / "run.json").exists()
+            if not run._is_new:
                 if overwrite:
                     run._clear()
                 else:
@@ -144,6 +148,16 @@ class RunDir:
         """Changes fields of run.json."""
         self.record |= as_plain(fields)
         write_json(self.path / "run.json", self.record)
+
+    def discard(self) -> None:
+        """Removes the directory if this process made the run and saved no state; else marks the run failed."""
+        if not self._is_new or list_steps(self.path / "checkpoints"):
+            self.update(status="failed")
+        else:
+            self._clear()
+            (self.path / _LOCK).unlink(missing_ok=True)
+            with suppress(OSError):
+                self.path.rmdir()
 
     def close(self) -> None:
         """Lets another process in."""
