@@ -35,15 +35,7 @@ WORDS += [f"--method.{name}={value}" for name, value in SETTINGS.items()]
 
 
 def _start(run: Path) -> subprocess.Popen:
-    command = [
-        sys.executable,
-        "-m",
-        "visdom_plugin.cli.train",
-        "method:3dgs-go+vd",
-        *SHORT,
-        "--out",
-        str(run),
-    ]
+    command = [sys.executable, "-m", "visdom_plugin.cli.train", *WORDS, f"--out={run}"]
     return subprocess.Popen(
         command, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "2"}, stderr=subprocess.PIPE, text=True
     )
