@@ -10,6 +10,7 @@ import torch
 from tests.splat.twin import make_camera, make_gaussians
 from visdom_plugin.errors import PluginError
 from visdom_plugin.splat.backend_gsplat import rasterise_gsplat
+from visdom_plugin.splat.rasterise import rasterise
 
 
 def fake_rasterization(seen):
@@ -61,3 +62,21 @@ def test_a_missing_gsplat_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(PluginError, match=r"visdom-plugin\[cuda\]"):
         rasterise_gsplat(make_gaussians(n=1), make_camera(), torch.ones(3), 0, 0.01)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_both_backends_draw_the_same():
+    pytest.importorskip("gsplat", reason="gsplat (extra [cuda]) is not installed")
+    camera, background = make_camera(61, 45, centre=(0.3, 0.6)), torch.tensor([0.2, 0.5, 0.9])
+    results = []
+    for device in ("cpu", "cuda"):
+        gaussians = make_gaussians(n=300, dtype=torch.float32).detach().to(device)
+        for parameter in gaussians.tensors().values():
+            parameter.requires_grad_()
+        render = rasterise(gaussians, camera.to(device), background)
+        (render.rgb.square().sum() + render.alpha.sum() + render.depth.sum()).backward()
+        gradients = [p.grad for p in gaussians.tensors().values()] + [render.info["means2d"].grad]
+        results.append([x.detach().cpu() for x in (render.rgb, render.alpha, render.depth, *gradients)])
+    for ours, theirs in zip(*results, strict=True):
+        assert (ours - theirs).norm() < 2e-3 * theirs.norm()
