@@ -131,6 +131,10 @@ def _classify(blocks, x, y, z, slack, sizes, starts, tables, table, states):
             visible += said in (_EMPTY, _FULL)
             occupied += said == _FULL
             unsettled += said == _OPEN
+            # Nothing the other views may say can save the block.
+            rest = unsettled + views - 1 - view
+            if not table[visible + rest, occupied + rest]:
+                break
         states[b] = _decide(table, visible, occupied, unsettled)
 
 
@@ -151,6 +155,33 @@ def classify_cells(
     states = np.empty(len(cells), np.uint8)
     _classify(cells, *terms, rounding_bounds(terms), silhouettes.sizes, starts, tables, rule.table(), states)
     return states
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _keep_centres(cells, x, y, z, sizes, offsets, pixels, table, kept):
+    views = len(sizes)
+    for b in prange(len(cells)):
+        i, j, k = cells[b, 0], cells[b, 1], cells[b, 2]
+        visible, occupied = 0, 0
+        for view in range(views):
+            depth = (x[view, 2, i] + y[view, 2, j]) + z[view, 2, k]
+            if depth > 0:
+                u = ((x[view, 0, i] + y[view, 0, j]) + z[view, 0, k]) / depth
+                v = ((x[view, 1, i] + y[view, 1, j]) + z[view, 1, k]) / depth
+                width, height = sizes[view]
+                if u >= 0 and u < width and v >= 0 and v < height:
+                    visible += 1
+                    occupied += pixels[offsets[view] + np.int64(v) * width + np.int64(u)]
+        kept[b] = table[visible, occupied]
+
+
+def keep_centres(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, cells: np.ndarray) -> np.ndarray:
+    """(M,) bool: what the rule says of the centres of some cells (M, 3) of a grid."""
+    terms = axis_terms(silhouettes.projections, [grid.centres(a) for a in range(3)])
+    kept = np.empty(len(cells), np.bool_)
+    table = rule.table()
+    _keep_centres(cells, *terms, silhouettes.sizes, silhouettes.offsets, silhouettes.pixels, table, kept)
+    return kept
 
 
 @njit(cache=True, nogil=True)

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from visdom_plugin.cameras import Cameras, look_at_point
-from visdom_plugin.hull.blocks import DROPPED, KEPT, MIXED, classify_cells, sum_areas
-from visdom_plugin.hull.components import find_pieces
+from visdom_plugin.hull.blocks import KEPT, MIXED, classify_cells, keep_centres, sum_areas
+from visdom_plugin.hull.components import find_pieces, piece_of
 from visdom_plugin.hull.rule import KeepRule
 from visdom_plugin.hull.votes import Grid, Silhouettes
 
@@ -21,9 +21,12 @@ log = logging.getLogger(__name__)
 
 _START = 32
 """Cells along a side of the first cube."""
-_FINEST = 96
-"""Cells along the found box's longest side when the search ends: its faces are known to about 1 %."""
-_MOST_CELLS = 2_000_000
+_FINEST = 64
+"""Cells along the found box's longest side when the search ends: its faces are known to about 1.5 %."""
+_MOST_CELLS = 3_000_000
+_MOST_LABELS = 1 << 24
+_ENOUGH = 1000
+"""Cells inside the region from which the volumes of its pieces can be compared; eight times as many settle it."""
 _DOUBLINGS = 4
 MARGIN_VOXELS = 2
 """Empty voxels between the region and the faces of the grid."""
@@ -48,8 +51,8 @@ def find_region(
     clipped to the first cube that holds any of it.
 
     Args:
-        drop_below: leave out pieces whose largest possible volume is below this fraction of the least possible
-            volume of the largest piece.
+        drop_below: leave out pieces with clearly less than this fraction of the largest piece's volume; 0 keeps
+            all.
         areas: from `blocks.sum_areas`.
     """
     areas = sum_areas(silhouettes) if areas is None else areas
@@ -88,16 +91,23 @@ def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, drop_below: float):
     cells = np.stack(np.unravel_index(np.arange(np.prod(grid.shape)), grid.shape), -1)
     settled = np.zeros((0, 3), np.int64)
     while True:
-        states = classify_cells(silhouettes, areas, grid, rule, np.ascontiguousarray(cells))
+        states = classify_cells(silhouettes, areas, grid, rule, cells)
         settled = np.concatenate([settled, cells[states == KEPT]])
         mixed = cells[states == MIXED]
-        if drop_below:
-            settled, mixed = _drop_small(settled, mixed, drop_below)
+        resolved = True
+        if drop_below and len(mixed):
+            inside = keep_centres(silhouettes, grid, rule, mixed)
+            volume = len(settled) + inside.sum()
+            resolved = volume >= 8 * _ENOUGH
+            if volume >= _ENOUGH:
+                settled, mixed, alone = _drop_small(settled, mixed, inside, drop_below)
+                resolved = resolved or alone
         if len(settled) + len(mixed) == 0:
             return None
-        low = np.minimum(settled.min(0, initial=1 << 40), mixed.min(0, initial=1 << 40))
-        high = np.maximum(settled.max(0, initial=-1), mixed.max(0, initial=-1)) + 1
-        if (high - low).max() >= _FINEST or 8 * len(mixed) > _MOST_CELLS or not len(mixed):
+        both = np.concatenate([settled, mixed])
+        low, high = both.min(0), both.max(0) + 1
+        fine = (high - low).max() >= _FINEST and resolved
+        if fine or 8 * len(mixed) > _MOST_CELLS or not len(mixed):
             box = grid.lower + np.stack([low, high]) * grid.voxel
             return box, bool((low == 0).any() or (high == np.array(grid.shape)).any())
         grid = Grid(grid.lower, grid.voxel / 2, tuple(2 * n for n in grid.shape))
@@ -110,26 +120,34 @@ def _split(cells: np.ndarray) -> np.ndarray:
     return (2 * cells[:, None] + corners).reshape(-1, 3)
 
 
-def _drop_small(settled: np.ndarray, mixed: np.ndarray, fraction: float):
-    """Leaves out pieces that cannot reach `fraction` of the largest, whatever the mixed cells turn out to be."""
-    both = np.concatenate([settled, mixed])
-    if not len(settled):
-        return settled, mixed
-    low = both.min(0)
-    grid = np.zeros(both.max(0) - low + 1, bool)
-    sure = np.zeros_like(grid)
-    grid[tuple((both - low).T)] = True
-    sure[tuple((settled - low).T)] = True
-    pieces = find_pieces(grid)
-    # Cells that are kept whole and touch are certain to be one piece.
-    least = find_pieces(sure).sizes.max(initial=0)
-    keep = pieces.sizes >= fraction * least
-    if keep.all():
-        return settled, mixed
-    from visdom_plugin.hull.components import erase_pieces
+def _drop_small(settled: np.ndarray, mixed: np.ndarray, inside: np.ndarray, fraction: float):
+    """Leaves out pieces whose volume, estimated from cell centres, is clearly below `fraction` of the largest's.
 
-    erase_pieces(grid, pieces, keep)
-    return tuple(x[grid[tuple((x - low).T)]] for x in (settled, mixed))
+    Pieces are joined through every cell that may hold a part of the region, however thin.
+
+    Args:
+        settled, mixed: (M, 3) cells kept whole, and cells kept perhaps in part.
+        inside: (M,) bool, the mixed cells whose centre is kept.
+
+    Returns:
+        settled, mixed, and whether one piece is certain to be all that stays.
+    """
+    both = np.concatenate([settled, mixed])
+    low, size = both.min(0), np.ptp(both, axis=0) + 1
+    # Labels on a coarser grid may join pieces, which can only keep more of them.
+    shift = 0
+    while np.prod(((size - 1) >> shift) + 1) > _MOST_LABELS:
+        shift += 1
+    where = (both - low) >> shift
+    grid = np.zeros(((size - 1) >> shift) + 1, bool)
+    grid[tuple(where.T)] = True
+    pieces = find_pieces(grid)
+    labels = piece_of(where, grid.shape, pieces)
+    counted = np.concatenate([np.ones(len(settled), bool), inside])
+    volumes = np.bincount(labels, weights=counted, minlength=len(pieces.sizes))
+    keep = volumes >= 0.9 * fraction * volumes.max()
+    stays = keep[labels]
+    return settled[stays[: len(settled)]], mixed[stays[len(settled) :]], shift == 0 and keep.sum() == 1
 
 
 def cube_around(box: np.ndarray, resolution: int) -> Grid:
@@ -143,6 +161,3 @@ def grid_in(bounds: np.ndarray, resolution: int) -> Grid:
     size = bounds[1] - bounds[0]
     voxel = float(size.max()) / resolution
     return Grid(bounds[0], voxel, tuple(int(n) for n in np.ceil(size / voxel - 1e-9).clip(1)))
-
-
-__all__ = ["DROPPED", "MARGIN_VOXELS", "Region", "cube_around", "find_region", "grid_in"]
