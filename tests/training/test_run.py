@@ -215,7 +215,9 @@ def test_a_mistake_found_before_the_first_step_leaves_no_trace(train, tmp_path, 
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_step_saves_and_the_same_command_goes_on(train, tmp_path, monkeypatch, number):
+def test_a_signal_ends_the_step_saves_and_the_same_command_goes_on(
+    train, tmp_path, monkeypatch, caplog, number
+):
     whole = train(run_dir=tmp_path / "whole")
     step_of = FakeMethod.train_step
 
@@ -232,7 +234,10 @@ def test_a_signal_ends_the_step_saves_and_the_same_command_goes_on(train, tmp_pa
     run = tmp_path / "run"
     assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
     assert checkpoints.list_steps(run / "checkpoints") == [18]
+    noted = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps(noted | {"threads": 99}))
     record = train()
+    assert f"threads: 99 -> {torch.get_num_threads()}" in caplog.text
     assert record["resumed_from"] == 18 and record["metrics"] == whole["metrics"]
     assert _same(_state(run), _state(tmp_path / "whole"))
     assert [row["step"] for row in _log(run)] == list(range(1, 41))

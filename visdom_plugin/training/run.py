@@ -20,7 +20,7 @@ from visdom_plugin.training.evaluate import carve_reference, evaluate
 from visdom_plugin.training.files import appearing, finite
 from visdom_plugin.training.protocols import Method
 from visdom_plugin.training.rundir import RunDir, describe_data
-from visdom_plugin.training.settings import as_plain
+from visdom_plugin.training.settings import as_plain, differences
 from visdom_plugin.training.trainer import Trainer, view_psnr
 
 log = logging.getLogger(__name__)
@@ -78,13 +78,13 @@ def train(
     with RunDir.open(run_dir, finite(identity), overwrite=overwrite) as run:
         if run.record["status"] == "finished":
             return run.record | {"resumed_from": None, "already_finished": True}
-        run.update(
-            status="running",
-            device=str(device),
-            versions=find_versions(),
-            threads=torch.get_num_threads(),
-            budget=budget,
-        )
+        circumstances = {
+            "device": str(device),
+            "versions": find_versions(),
+            "threads": torch.get_num_threads(),
+        }
+        _warn_of_changes(run.record, circumstances)
+        run.update(status="running", budget=budget, **circumstances)
         try:
             resumed = _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds)
         except KeyboardInterrupt:
@@ -128,6 +128,15 @@ def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoi
         metrics=finite(found),
     )
     return trainer.resumed_from
+
+
+def _warn_of_changes(before: dict[str, Any], now: dict[str, Any]) -> None:
+    lines = differences({k: before[k] for k in now if k in before}, {k: now[k] for k in now if k in before})
+    if lines:
+        log.warning(
+            "the run goes on under other circumstances, its result may differ in the last digits: %s",
+            "; ".join(lines),
+        )
 
 
 def build(
