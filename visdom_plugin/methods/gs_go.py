@@ -6,6 +6,7 @@ repair. Hooks, where there are any, give the initial points and add their losses
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,13 +20,16 @@ from visdom_plugin.methods.configs import GsGoConfig
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
+from visdom_plugin.splat.backend_cpu import warm_up
 from visdom_plugin.splat.densify import initial_log_scales, split_children, stray_gaussians
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.optimiser import GaussianOptimiser
 from visdom_plugin.splat.ply import write_ply
 from visdom_plugin.splat.rasterise import rasterise
+from visdom_plugin.splat.spherical_harmonics import sh_from_rgb
 
-SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant harmonic
+log = logging.getLogger(__name__)
+
 INITIAL_OPACITY = 0.1  # 3DGS
 RESET_OPACITY = 0.01  # 3DGS
 
@@ -42,6 +46,9 @@ class GsGo:
     ) -> None:
         self.device, self.seed, self.hooks = device, seed, list(hooks)
         self.extent = scene_extent(views.cameras)
+        if device.type == "cpu":
+            log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
+            warm_up()
         draw = generator(seed, "initial_points")
         if self.hooks:
             xyz, rgb = self.hooks[0].initial_points(self.config.initial_points, draw)
@@ -55,7 +62,7 @@ class GsGo:
             "log_scales": initial_log_scales(xyz),
             "quaternions": torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
             "opacity_logits": torch.full((n,), INITIAL_OPACITY).logit(),
-            "sh_dc": ((rgb - 0.5) / SH_C0)[:, None, :],
+            "sh_dc": sh_from_rgb(rgb)[:, None, :],
             "sh_rest": torch.zeros(n, coefficients - 1, 3),
         }
         self.optimiser = GaussianOptimiser(
@@ -81,6 +88,8 @@ class GsGo:
         render = self._rasterise(gaussians, batch.camera, background)
         self._render = render
         target = batch.image * batch.mask[..., None] + background * (1 - batch.mask[..., None])
+        mse = (render.rgb.detach() - target).square().mean()
+        self.metrics = {"psnr": float(-10 * mse.clamp_min(1e-10).log10())}
         losses = {"photometric": photometric_loss(render.rgb, target, c.ssim_weight)}
         if c.mask_weight:
             losses["mask"] = c.mask_weight * mask_loss(render.alpha, batch.mask)
