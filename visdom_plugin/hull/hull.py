@@ -106,7 +106,7 @@ class Hull:
     @property
     def extent(self) -> np.ndarray:
         """(2, 3) tight box around the occupied voxels, world frame; the grid's own box for an empty hull."""
-        return self._once("extent", lambda: self.bounds[0] + _occupied_box(self.occupancy) * self.voxel_edges)
+        return self._once("extent", lambda: self.bounds[0] + occupied_box(self.occupancy) * self.voxel_edges)
 
     @property
     def centre(self) -> np.ndarray:
@@ -174,7 +174,7 @@ class Hull:
         """
 
         def make():
-            lower, upper = _occupied_box(self.occupancy).astype(int)
+            lower, upper = occupied_box(self.occupancy).astype(int)
             window = tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))
             vertices, faces = mesh_grid(self.occupancy[window])
             return self.bounds[0] + (vertices + lower) * self.voxel_edges, faces
@@ -295,7 +295,7 @@ def write_whole(path: str | Path, write: Callable[[Any], Any]) -> None:
         raise
 
 
-def _occupied_box(occupancy: np.ndarray) -> np.ndarray:
+def occupied_box(occupancy: np.ndarray) -> np.ndarray:
     """(2, 3) int: first and one past the last occupied index per axis; the whole grid where it is empty."""
     plane = occupancy.any(0)
     if not plane.any():

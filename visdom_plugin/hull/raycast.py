@@ -16,7 +16,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from visdom_plugin.cameras import Cameras
-from visdom_plugin.hull.hull import Hull
+from visdom_plugin.hull.hull import Hull, occupied_box
 
 _BRICK = 4
 _FARTHEST = 255
@@ -88,88 +88,93 @@ def build_bricks(occupancy: np.ndarray) -> Bricks:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _plane(index, origin, inverse):
-    return (index - origin) * inverse
+def _slope(d):
+    """Inverse, constant, step, and which plane of a voxel is ahead: t at plane p is (p - o) * inverse + constant."""
+    if d > 0:
+        return 1.0 / d, 0.0, 1, 1
+    if d < 0:
+        return 1.0 / d, 0.0, -1, 0
+    return 0.0, np.inf, 0, 1
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _within(value, low, high):
+    # Inside the grid no value is below zero, so cutting off the fraction is the floor.
+    index = np.int64(value)
+    index = index if index > low else low
+    return index if index < high else high
 
 
 @njit(cache=True, nogil=True)
-def _first_hit(ox, oy, oz, dx, dy, dz, begin, end, shape, bits, distance):
-    """Smallest t in [begin, end] at which the ray is in an occupied voxel; -1 without one. Units of voxels."""
-    ix = 1.0 / dx if dx != 0 else np.inf
-    iy = 1.0 / dy if dy != 0 else np.inf
-    iz = 1.0 / dz if dz != 0 else np.inf
+def _first_hit(ox, oy, oz, dx, dy, dz, begin, end, nx, ny, nz, bits, distance):
+    """Smallest t in [begin, end) at which the ray is in an occupied voxel; -1 without one. Units of voxels."""
+    ix, cx, sx, px = _slope(dx)
+    iy, cy, sy, py = _slope(dy)
+    iz, cz, sz, pz = _slope(dz)
     t = begin
-    nx, ny, nz = shape
-    x = min(max(np.int64(np.floor(ox + t * dx)), 0), nx - 1)
-    y = min(max(np.int64(np.floor(oy + t * dy)), 0), ny - 1)
-    z = min(max(np.int64(np.floor(oz + t * dz)), 0), nz - 1)
+    x, y, z = (
+        _within(ox + t * dx, 0, nx - 1),
+        _within(oy + t * dy, 0, ny - 1),
+        _within(oz + t * dz, 0, nz - 1),
+    )
     while True:
         a, b, c = x >> 2, y >> 2, z >> 2
         free = np.int64(distance[a, b, c])
         if free == 0:
-            # Voxel by voxel to the end of this brick.
+            # Voxel by voxel to the end of this brick, without branches on the axis.
             word = bits[a, b, c]
-            sx = 1 if dx > 0 else -1
-            sy = 1 if dy > 0 else -1
-            sz = 1 if dz > 0 else -1
-            tx = _plane(x + (dx > 0), ox, ix) if dx != 0 else np.inf
-            ty = _plane(y + (dy > 0), oy, iy) if dy != 0 else np.inf
-            tz = _plane(z + (dz > 0), oz, iz) if dz != 0 else np.inf
+            tx, ty, tz = (x + px - ox) * ix + cx, (y + py - oy) * iy + cy, (z + pz - oz) * iz + cz
             while True:
-                if word >> np.uint64((x & 3) + 4 * (y & 3) + 16 * (z & 3)) & np.uint64(1):
+                if word >> np.uint64((x & 3) | (y & 3) << 2 | (z & 3) << 4) & np.uint64(1):
                     return t
-                if tx <= ty and tx <= tz:
-                    t = max(t, tx)
-                    x += sx
-                    tx = _plane(x + (dx > 0), ox, ix)
-                elif ty <= tz:
-                    t = max(t, ty)
-                    y += sy
-                    ty = _plane(y + (dy > 0), oy, iy)
-                else:
-                    t = max(t, tz)
-                    z += sz
-                    tz = _plane(z + (dz > 0), oz, iz)
-                if t > end or x < 0 or y < 0 or z < 0 or x >= nx or y >= ny or z >= nz:
-                    return -1.0
-                if x >> 2 != a or y >> 2 != b or z >> 2 != c:
+                out = tx if tx < ty else ty
+                out = out if out < tz else tz
+                on_x = np.int64(tx == out)
+                on_y = np.int64(ty == out) & (1 - on_x)
+                on_z = 1 - on_x - on_y
+                x, y, z = x + sx * on_x, y + sy * on_y, z + sz * on_z
+                tx, ty, tz = (x + px - ox) * ix + cx, (y + py - oy) * iy + cy, (z + pz - oz) * iz + cz
+                t = out if out > t else t
+                if ((x >> 2) ^ a) | ((y >> 2) ^ b) | ((z >> 2) ^ c):
                     break
         else:
             # All bricks nearer than `free` are empty: leave their cube at once.
-            x0, x1 = 4 * (a - free + 1), 4 * (a + free)
-            y0, y1 = 4 * (b - free + 1), 4 * (b + free)
-            z0, z1 = 4 * (c - free + 1), 4 * (c + free)
-            tx = _plane(x1 if dx > 0 else x0, ox, ix) if dx != 0 else np.inf
-            ty = _plane(y1 if dy > 0 else y0, oy, iy) if dy != 0 else np.inf
-            tz = _plane(z1 if dz > 0 else z0, oz, iz) if dz != 0 else np.inf
-            out = min(tx, ty, tz)
-            t = max(t, out)
-            if t > end:
-                return -1.0
+            x0, x1 = (a - free + 1) << 2, (a + free) << 2
+            y0, y1 = (b - free + 1) << 2, (b + free) << 2
+            z0, z1 = (c - free + 1) << 2, (c + free) << 2
+            tx = ((x1 if px else x0) - ox) * ix + cx
+            ty = ((y1 if py else y0) - oy) * iy + cy
+            tz = ((z1 if pz else z0) - oz) * iz + cz
+            out = tx if tx < ty else ty
+            out = out if out < tz else tz
+            t = out if out > t else t
             # The axis that leaves goes exactly one past the cube; rounding must not push the others out of it.
-            px, py, pz = np.floor(ox + t * dx), np.floor(oy + t * dy), np.floor(oz + t * dz)
-            x = (x1 if dx > 0 else x0 - 1) if tx == out else min(max(np.int64(px), x0), x1 - 1)
-            y = (y1 if dy > 0 else y0 - 1) if ty == out else min(max(np.int64(py), y0), y1 - 1)
-            z = (z1 if dz > 0 else z0 - 1) if tz == out else min(max(np.int64(pz), z0), z1 - 1)
-            if x < 0 or y < 0 or z < 0 or x >= nx or y >= ny or z >= nz:
-                return -1.0
+            x = _within(ox + t * dx, x0, x1 - 1)
+            y = _within(oy + t * dy, y0, y1 - 1)
+            z = _within(oz + t * dz, z0, z1 - 1)
+            x = (x1 if px else x0 - 1) if tx == out else x
+            y = (y1 if py else y0 - 1) if ty == out else y
+            z = (z1 if pz else z0 - 1) if tz == out else z
+        if t >= end or x < 0 or y < 0 or z < 0 or x >= nx or y >= ny or z >= nz:
+            return -1.0
 
 
-@njit(cache=True, nogil=True)
-def _clip_axis(o, d, n, near, far):
+@njit(cache=True, nogil=True, inline="always")
+def _clip_axis(o, d, low, high, near, far):
     if d == 0:
-        return (near, far) if 0 <= o < n else (1.0, 0.0)
+        return (near, far) if low <= o < high else (1.0, 0.0)
     inverse = 1.0 / d
-    t0, t1 = -o * inverse, (n - o) * inverse
-    return max(near, min(t0, t1)), min(far, max(t0, t1))
+    t0, t1 = (low - o) * inverse, (high - o) * inverse
+    t0, t1 = (t0, t1) if t0 < t1 else (t1, t0)
+    return t0 if t0 > near else near, t1 if t1 < far else far
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _cast(origins, directions, lower, scale, shape, bits, distance, both, first, last, hit):
-    count = max(len(origins), len(directions))
+def _cast(origins, directions, lower, scale, box, shape, bits, distance, both, first, last, hit):
     # One origin may serve all rays of a camera.
     step = 0 if len(origins) == 1 else 1
-    for r in prange(count):
+    nx, ny, nz = shape
+    for r in prange(len(directions)):
         o, d = origins[r * step], directions[r]
         ox, oy, oz = (o[0] - lower[0]) * scale[0], (o[1] - lower[1]) * scale[1], (o[2] - lower[2]) * scale[2]
         dx, dy, dz = d[0] * scale[0], d[1] * scale[1], d[2] * scale[2]
@@ -177,30 +182,19 @@ def _cast(origins, directions, lower, scale, shape, bits, distance, both, first,
         # Also rejects NaN.
         if not (dx * dx + dy * dy + dz * dz > 0):
             continue
-        near, far = _clip_axis(ox, dx, shape[0], 0.0, np.inf)
-        near, far = _clip_axis(oy, dy, shape[1], near, far)
-        near, far = _clip_axis(oz, dz, shape[2], near, far)
-        if not near <= far:
+        near, far = _clip_axis(ox, dx, box[0, 0], box[1, 0], 0.0, np.inf)
+        near, far = _clip_axis(oy, dy, box[0, 1], box[1, 1], near, far)
+        near, far = _clip_axis(oz, dz, box[0, 2], box[1, 2], near, far)
+        if not near < far:
             continue
-        t = _first_hit(ox, oy, oz, dx, dy, dz, near, far, shape, bits, distance)
+        t = _first_hit(ox, oy, oz, dx, dy, dz, near, far, nx, ny, nz, bits, distance)
         if t < 0:
             continue
         first[r], hit[r] = t, True
         if both:
             # The last exit is the first hit from the other end. Rounding may lose a ray that grazes an edge.
-            back = _first_hit(
-                ox + far * dx,
-                oy + far * dy,
-                oz + far * dz,
-                -dx,
-                -dy,
-                -dz,
-                0.0,
-                far - t,
-                shape,
-                bits,
-                distance,
-            )
+            px, py, pz = ox + far * dx, oy + far * dy, oz + far * dz
+            back = _first_hit(px, py, pz, -dx, -dy, -dz, 0.0, far - t, nx, ny, nz, bits, distance)
             last[r] = far - back if back >= 0 else t
 
 
@@ -227,14 +221,17 @@ def cast(hull: Hull, origins, directions) -> Crossing:
 
 
 def _walk(hull: Hull, origins: Tensor, directions: Tensor, shape, *, both: bool):
-    rays = [directions.expand(*shape, 3).reshape(-1, 3)]
-    rays.append(origins.reshape(1, 3) if origins.numel() == 3 else origins.expand(*shape, 3).reshape(-1, 3))
-    directions, origins = (x.double().contiguous().numpy() for x in rays)
+    origins = origins.reshape(1, 3) if origins.numel() == 3 else origins.expand(*shape, 3).reshape(-1, 3)
+    directions = directions.expand(*shape, 3).reshape(-1, 3)
+    if directions.dtype != torch.float32 or origins.dtype != torch.float32:
+        directions, origins = directions.double(), origins.double()
+    directions, origins = directions.contiguous().numpy(), origins.contiguous().numpy()
     bricks = hull._once("bricks", lambda: build_bricks(hull.occupancy))
     first, last = np.empty(len(directions)), np.empty(len(directions))
     hit = np.empty(len(directions), np.bool_)
     lower, scale = np.ascontiguousarray(hull.bounds[0]), 1 / hull.voxel_edges
-    _cast(origins, directions, lower, scale, np.array(hull.shape), *bricks, both, first, last, hit)
+    box = hull._once("box", lambda: occupied_box(hull.occupancy).astype(float))
+    _cast(origins, directions, lower, scale, box, np.array(hull.shape), *bricks, both, first, last, hit)
     return tuple(torch.from_numpy(x).reshape(shape) for x in (first, last, hit))
 
 
@@ -248,13 +245,13 @@ def march(hull: Hull, origins: Tensor, directions: Tensor) -> Crossing:
     lower, edges = (torch.as_tensor(x, device=device) for x in (hull.bounds[0], hull.voxel_edges))
     o = ((origins.detach().double() - lower) / edges).expand(*shape, 3).reshape(-1, 3)
     d = (directions.detach().double() / edges).expand(*shape, 3).reshape(-1, 3)
-    n = torch.tensor(hull.shape, device=device)
-    planes = torch.stack([-o / d, (n - o) / d])
-    within = (o >= 0) & (o < n)
+    low, high = torch.as_tensor(occupied_box(hull.occupancy), device=device)
+    planes = torch.stack([(low - o) / d, (high - o) / d])
+    within = (o >= low) & (o < high)
     planes = torch.where(d == 0, torch.where(within, torch.inf, torch.nan), planes)
     near = torch.where(d == 0, -planes[0], planes.amin(0)).amax(-1).clamp_min(0)
     far = planes.amax(0).amin(-1)
-    alive = (near <= far) & (d.square().sum(-1) > 0) & torch.isfinite(far)
+    alive = (near < far) & (d.square().sum(-1) > 0) & torch.isfinite(far)
     first = _march_ahead(hull, o, d, near, far, alive)
     hit = first >= 0
     end = torch.where(hit, far, 0.0)[:, None]
@@ -288,7 +285,7 @@ def _march_ahead(hull: Hull, o: Tensor, d: Tensor, begin: Tensor, end: Tensor, a
         t = torch.maximum(t, out)
         inside = torch.floor(o + t[:, None] * d).long().maximum(low).minimum(high - 1)
         voxel = torch.where(planes == out[:, None], torch.where(d > 0, high, low - 1), inside)
-        on = ~stop & (t <= end) & ((voxel >= 0) & (voxel < size)).all(-1)
+        on = ~stop & (t < end) & ((voxel >= 0) & (voxel < size)).all(-1)
         rays, o, d, t, end, voxel = (x[on] for x in (rays, o, d, t, end, voxel))
     return found
 
