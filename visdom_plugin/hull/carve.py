@@ -34,7 +34,8 @@ def keep_rule(domain: VisibleDomain, views: int) -> KeepRule:
 
 def carve(domain: VisibleDomain, cameras: Cameras, masks: Sequence) -> Hull:
     """See `VisibleDomain.carve`."""
-    from visdom_plugin.hull.diagnose import choose_k, explain_empty
+    from visdom_plugin.hull.diagnose import choose_k, look_inverted
+    from visdom_plugin.hull.empty import explain_empty
 
     silhouettes = gather_silhouettes(cameras, masks, domain.dilate_px)
     asked = domain.k
@@ -45,6 +46,20 @@ def carve(domain: VisibleDomain, cameras: Cameras, masks: Sequence) -> Hull:
     if hull is None:
         raise explain_empty(domain, cameras, silhouettes)
     hull.summary["k_asked"] = asked
+    if not hull.summary["bounds_closed"]:
+        log.warning(
+            "the views leave the hull open: it is cut off at %s .. %s; more views from other sides, a larger k or "
+            "explicit bounds would close it",
+            *np.round(hull.bounds, 4).tolist(),
+        )
+    inverted = [i for i in range(len(silhouettes)) if look_inverted(silhouettes.mask(i))]
+    if 2 * len(inverted) > len(silhouettes):
+        log.warning(
+            "%d of %d masks are foreground along most of the image's border: they may mark the background; "
+            "`visdom-hull --diagnose` tells more",
+            len(inverted),
+            len(silhouettes),
+        )
     log.info(
         "hull: %s, %d views; %s; %d of %s voxels of %.4g, %d of %d pieces, %.2f s",
         domain.kind, len(silhouettes), hull.summary["agreement_means"], hull.voxels,
@@ -113,12 +128,6 @@ def _place(domain: VisibleDomain, cameras, silhouettes, rule: KeepRule, areas):
         region = _visible_region(domain, cameras, silhouettes, rule, areas, drop)
         if region is None:
             return None
-        if not region.closed:
-            log.warning(
-                "the views leave the hull open: it is cut off at %s; more views from other sides, a larger k or "
-                "explicit bounds would close it",
-                np.array2string(region.bounds, precision=4, separator=", "),
-            )
     ball = None
     if needs_ball:
         box = None if region is None else region.bounds

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-
 _ONES = np.uint64(0x0101010101010101)
 
 

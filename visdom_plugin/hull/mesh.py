@@ -232,3 +232,11 @@ def mesh_grid(occupancy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         faces,
     )
     return vertices, faces
+
+
+def is_closed(faces) -> bool:
+    """Whether every edge of a mesh (F, 3) is in exactly two faces, which run along it in opposite directions."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    count = int(edges.max(initial=0)) + 1
+    ahead, back = (np.sort(edges[:, a] * count + edges[:, 1 - a]) for a in (0, 1))
+    return bool(np.array_equal(ahead, back) and (np.diff(ahead) > 0).all())

@@ -89,7 +89,7 @@ def build_bricks(occupancy: np.ndarray) -> Bricks:
 
 @njit(cache=True, nogil=True, inline="always")
 def _slope(d):
-    """Inverse, constant, step, and which plane of a voxel is ahead: t at plane p is (p - o) * inverse + constant."""
+    """Inverse, constant, step, next plane of a voxel: t at plane p is (p - o) * inverse + constant."""
     if d > 0:
         return 1.0 / d, 0.0, 1, 1
     if d < 0:

@@ -8,6 +8,7 @@ in float64 and in one order, which `blocks` repeats, so that both agree voxel fo
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +44,8 @@ class Grid(NamedTuple):
         return self.lower[axis] + np.arange(self.shape[axis] + 1) * self.voxel
 
 
-class Silhouettes(NamedTuple):
+@dataclass(frozen=True)
+class Silhouettes:
     """Masks of one capture with their projections."""
 
     projections: np.ndarray
@@ -66,8 +68,8 @@ class Silhouettes(NamedTuple):
     def without(self, view: int) -> Silhouettes:
         """The same capture less one view."""
         rest = np.arange(len(self)) != view
-        return self._replace(
-            projections=self.projections[rest], sizes=self.sizes[rest], offsets=self.offsets[rest]
+        return replace(
+            self, projections=self.projections[rest], sizes=self.sizes[rest], offsets=self.offsets[rest]
         )
 
 
