@@ -6,6 +6,7 @@ import json
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -254,7 +255,18 @@ class Hull:
                 raise ValueError("size of the grid")
             occupancy = np.unpackbits(packed, count=count).view(bool).reshape(shape)
             return cls.from_grid(occupancy, header["bounds"], header["summary"])
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, ConfigError) as error:
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            EOFError,
+            NotImplementedError,
+            RuntimeError,
+            zlib.error,
+            zipfile.BadZipFile,
+            ConfigError,
+        ) as error:
             missing = isinstance(error, FileNotFoundError)
             raise CheckpointError(
                 "there is no such hull file" if missing else "this is not a hull file, or it is damaged",

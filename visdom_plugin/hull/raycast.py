@@ -180,7 +180,7 @@ def _cast(origins, directions, lower, scale, box, shape, bits, distance, both, f
         dx, dy, dz = d[0] * scale[0], d[1] * scale[1], d[2] * scale[2]
         first[r], last[r], hit[r] = 0, 0, False
         # Also rejects NaN.
-        if not (dx * dx + dy * dy + dz * dz > 0):
+        if not (dx * dx + dy * dy + dz * dz > 0 and abs(ox) + abs(oy) + abs(oz) < np.inf):
             continue
         near, far = _clip_axis(ox, dx, box[0, 0], box[1, 0], 0.0, np.inf)
         near, far = _clip_axis(oy, dy, box[0, 1], box[1, 1], near, far)

@@ -25,6 +25,7 @@ _FINEST = 64
 """Cells along the found box's longest side when the search ends: its faces are known to about 1.5 %."""
 _MOST_CELLS = 3_000_000
 _MOST_LABELS = 1 << 24
+_MOST_SIDE = 1 << 15
 _ENOUGH = 1000
 """Cells inside the region from which the volumes of its pieces can be compared; eight times as many settle it."""
 _DOUBLINGS = 4
@@ -95,19 +96,21 @@ def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, drop_below: float):
         settled = np.concatenate([settled, cells[states == KEPT]])
         mixed = cells[states == MIXED]
         resolved = True
+        inside = keep_centres(silhouettes, grid, rule, mixed)
+        volume = len(settled) + inside.sum()
         if drop_below and len(mixed):
-            inside = keep_centres(silhouettes, grid, rule, mixed)
-            volume = len(settled) + inside.sum()
             resolved = volume >= 8 * _ENOUGH
             if volume >= _ENOUGH:
                 settled, mixed, alone = _drop_small(settled, mixed, inside, drop_below)
                 resolved = resolved or alone
-        if len(settled) + len(mixed) == 0:
+        finest = grid.shape[0] >= _MOST_SIDE
+        # Corners of several frusta stay undecided in cells of any size.
+        if len(settled) + len(mixed) == 0 or (finest and volume == 0):
             return None
         both = np.concatenate([settled, mixed])
         low, high = both.min(0), both.max(0) + 1
         fine = (high - low).max() >= _FINEST and resolved
-        if fine or 8 * len(mixed) > _MOST_CELLS or not len(mixed):
+        if fine or finest or 8 * len(mixed) > _MOST_CELLS or not len(mixed):
             box = grid.lower + np.stack([low, high]) * grid.voxel
             return box, bool((low == 0).any() or (high == np.array(grid.shape)).any())
         grid = Grid(grid.lower, grid.voxel / 2, tuple(2 * n for n in grid.shape))

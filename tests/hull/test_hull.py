@@ -1,0 +1,224 @@
+"""The grid, its mesh, its points and its files."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from visdom_plugin.errors import CheckpointError, ConfigError
+from visdom_plugin.hull.components import choose_pieces, erase_pieces, find_pieces
+from visdom_plugin.hull.hull import Hull, write_whole
+from visdom_plugin.hull.mesh import is_closed, mesh_grid
+
+
+def ball(n: int = 40, radius: float = 0.7) -> Hull:
+    axis = (np.arange(n) + 0.5) / n * 2 - 1
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    return Hull.from_grid(x**2 + y**2 + z**2 < radius**2, [[-1] * 3, [1] * 3])
+
+
+@given(st.integers(0, 10**9), st.floats(0, 1))
+@settings(max_examples=60, deadline=None)
+def test_mesh_of_any_grid_is_closed_and_outward(seed, fill):
+    random = np.random.default_rng(seed)
+    grid = random.random(random.integers(1, 12, 3)) < fill
+    vertices, faces = mesh_grid(grid)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert is_closed(faces)
+    if grid.any():
+        assert mesh.is_watertight and mesh.is_winding_consistent
+        assert mesh.volume > 0
+        # The surface passes between voxel centres: each inside one is inside, no outside one is.
+        winding = [winding_number(vertices[faces], c) for c in np.argwhere(np.pad(grid, 1)) - 0.5]
+        assert np.allclose(winding, 1, atol=1e-6)
+        empty = np.argwhere(~np.pad(grid, 1))[::7] - 0.5
+        assert np.allclose([winding_number(vertices[faces], c) for c in empty], 0, atol=1e-6)
+    else:
+        assert len(faces) == len(vertices) == 0
+
+
+def winding_number(triangles, point) -> float:
+    """Solid angle over 4 pi (van Oosterom and Strackee 1983)."""
+    a, b, c = (triangles[:, i] - point for i in range(3))
+    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+    numerator = (a * np.cross(b, c)).sum(1)
+    below = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (a * c).sum(1) * lb
+    return float(2 * np.arctan2(numerator, below).sum() / (4 * np.pi))
+
+
+def test_is_closed_sees_a_missing_and_a_turned_face():
+    _, faces = mesh_grid(np.ones((2, 2, 2), bool))
+    turned = faces.copy()
+    turned[3] = turned[3, ::-1]
+    assert is_closed(faces) and not is_closed(faces[1:]) and not is_closed(turned)
+
+
+def test_volume_and_area_of_a_ball_and_a_box():
+    hull = ball(80)
+    assert hull.volume == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=0.01)
+    vertices, faces = hull.to_mesh()
+    assert trimesh.Trimesh(vertices, faces, process=False).volume == pytest.approx(hull.volume, rel=0.01)
+    assert np.allclose(hull.centre, 0, atol=1e-9) and hull.radius == pytest.approx(0.7, abs=hull.voxel_size)
+    grid = np.zeros((20, 30, 40), bool)
+    grid[2:12, 5:25, 10:40] = True
+    box = Hull.from_grid(grid, [[1, 2, 3], [3, 5, 7]])
+    assert box.volume == pytest.approx(1.0 * 2.0 * 3.0)
+    # Edges are bevelled by half a voxel.
+    assert box.surface_area == pytest.approx(22, rel=0.02) and box.surface_area < 22
+    assert np.allclose(box.extent, [[1.2, 2.5, 4], [2.2, 4.5, 7]])
+
+
+@given(st.integers(0, 10**9))
+@settings(max_examples=30, deadline=None)
+def test_contains_is_the_voxel_of_the_point(seed):
+    random = np.random.default_rng(seed)
+    shape = random.integers(1, 9, 3)
+    grid = random.random(shape) < 0.5
+    low = random.normal(size=3)
+    hull = Hull.from_grid(grid, [low, low + shape * 0.25])
+    points = low + (random.random((7, 50, 3)) * 1.4 - 0.2) * shape * 0.25
+    wanted = np.zeros(points.shape[:2], bool)
+    for index in np.ndindex(*wanted.shape):
+        voxel = np.floor((points[index] - low) / 0.25).astype(int)
+        wanted[index] = (voxel >= 0).all() and (voxel < shape).all() and grid[tuple(voxel.clip(0, shape - 1))]
+    assert np.array_equal(hull.contains(points), wanted)
+    assert np.array_equal(hull.contains(torch.from_numpy(points)).numpy(), wanted)
+
+
+def test_contains_with_a_margin_reaches_beyond_the_grid():
+    hull = Hull.from_grid(np.ones((2, 2, 2)), [[0, 0, 0], [2, 2, 2]])
+    points = torch.tensor([[2.5, 1, 1], [3.5, 1, 1], [-0.9, -0.9, -0.9]])
+    assert hull.contains(points).tolist() == [False] * 3
+    assert hull.contains(points, margin_voxels=1).tolist() == [True, False, True]
+    assert hull.contains(points, margin_voxels=1.5).tolist() == [True, True, True]
+
+
+def test_points_on_the_surface_are_uniform_and_repeatable():
+    hull = ball()
+    points = hull.sample_points(20_000, torch.Generator().manual_seed(1))
+    again = hull.sample_points(20_000, torch.Generator().manual_seed(1))
+    assert points.shape == (20_000, 3) and torch.equal(points, again)
+    assert not torch.equal(points, hull.sample_points(20_000, torch.Generator().manual_seed(2)))
+    assert (points.norm(dim=-1) - 0.7).abs().max() < hull.voxel_size
+    assert points.mean(0).abs().max() < 0.02
+    vertices, faces = hull.to_mesh()
+    centres, area = vertices[faces].mean(1), trimesh.Trimesh(vertices, faces, process=False).area_faces
+    share = area[centres[:, 2] > 0.35].sum() / area.sum()
+    assert (points[:, 2] > 0.35).float().mean() == pytest.approx(share, abs=0.015)
+
+
+def test_points_inside_are_uniform_and_repeatable():
+    hull = ball()
+    points = hull.sample_inside(20_000, torch.Generator().manual_seed(1))
+    assert torch.equal(points, hull.sample_inside(20_000, torch.Generator().manual_seed(1)))
+    assert hull.contains(points).all() and points.mean(0).abs().max() < 0.02
+    assert points.norm(dim=-1).mean() == pytest.approx(0.75 * 0.7, rel=0.02)
+
+
+def test_an_empty_hull_answers():
+    hull = Hull.from_grid(np.zeros((4, 4, 4)), [[0, 0, 0], [1, 1, 1]])
+    assert hull.volume == 0 and hull.radius == 0 and hull.surface_area == 0 and len(hull.to_mesh()[1]) == 0
+    assert hull.sample_points(5).shape == hull.sample_inside(5).shape == (0, 3)
+    assert not hull.contains(torch.rand(9, 3)).any() and np.allclose(hull.centre, 0.5)
+
+
+def test_from_grid_takes_numbers_and_refuses_nonsense():
+    values = torch.tensor([[[0.4, 0.6]]])
+    assert Hull.from_grid(values, [[0, 0, 0], [1, 1, 2]]).occupancy.tolist() == [[[False, True]]]
+    for array, bounds in [
+        (np.ones((2, 2)), [[0] * 3, [1] * 3]),
+        (np.ones((2, 2, 2)), [[0] * 3, [0] * 3]),
+        (np.ones((2, 2, 2)), [[0] * 3, [np.nan] * 3]),
+        (np.ones((2, 2, 2)), [0, 1]),
+    ]:
+        with pytest.raises(ConfigError):
+            Hull.from_grid(array, bounds)
+
+
+def test_save_and_load_round_trip(tmp_path):
+    random = np.random.default_rng(0)
+    hull = Hull.from_grid(random.random((5, 6, 7)) < 0.5, [[-1, -2, -3], [4, 4, 4]], {"k": 3, "kind": "visdom"})
+    hull.save(tmp_path / "deep" / "hull.npz")
+    back = Hull.load(tmp_path / "deep" / "hull.npz")
+    assert back == hull and back.summary == hull.summary and back.occupancy.dtype == bool
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["hull.npz"]
+
+
+def test_damaged_files_are_refused(tmp_path):
+    path = tmp_path / "hull.npz"
+    ball(12).save(path)
+    whole = path.read_bytes()
+    for size in (0, 1, 50, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(CheckpointError):
+            Hull.load(path)
+    for at in range(30, len(whole), 97):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 255]) + whole[at + 1 :])
+        try:
+            assert Hull.load(path) == ball(12)
+        except CheckpointError:
+            pass
+    np.savez(path, other=np.zeros(3))
+    with pytest.raises(CheckpointError):
+        Hull.load(path)
+    with pytest.raises(CheckpointError, match="no such"):
+        Hull.load(tmp_path / "nothing.npz")
+
+
+def test_a_writer_that_fails_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+
+    def fail(file):
+        file.write(b"half")
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        write_whole(path, fail)
+    assert path.read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_ply_opens_in_trimesh(tmp_path):
+    hull = ball(16)
+    hull.write_ply(tmp_path / "hull.ply")
+    mesh = trimesh.load(tmp_path / "hull.ply", process=False)
+    vertices, faces = hull.to_mesh()
+    assert np.allclose(mesh.vertices, vertices, atol=1e-6) and np.array_equal(mesh.faces, faces)
+    assert mesh.is_watertight and mesh.volume > 0
+
+
+def test_pickle_and_deepcopy():
+    hull = ball(12)
+    hull.to_mesh()
+    for other in (copy.deepcopy(hull), pickle.loads(pickle.dumps(hull))):
+        assert other == hull and not other._derived
+
+
+@given(st.integers(0, 10**9), st.floats(0.02, 0.6))
+@settings(max_examples=50, deadline=None)
+def test_pieces_are_those_of_26_neighbours(seed, fill):
+    from scipy import ndimage
+
+    random = np.random.default_rng(seed)
+    grid = random.random(random.integers(1, 20, 3)) < fill
+    if random.random() < 0.5:
+        grid = np.repeat(grid, 8, axis=2)
+    labels, count = ndimage.label(grid, np.ones((3, 3, 3)))
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+    pieces = find_pieces(grid)
+    assert sorted(pieces.sizes) == sorted(sizes)
+    for policy in ("all", "largest", "drop-small"):
+        keep = choose_pieces(pieces.sizes, policy, 0.3)
+        left = grid.copy()
+        erase_pieces(left, pieces, keep)
+        wanted = {"all": sizes > 0, "largest": sizes == sizes.max(initial=0), "drop-small": sizes >= 0.3 * sizes.max(initial=0)}
+        allowed = grid & np.concatenate([[False], wanted[policy]])[labels]
+        if policy == "largest":
+            assert left.sum() == sizes.max(initial=0) and not (left & ~allowed).any()
+        else:
+            assert np.array_equal(left, allowed)
