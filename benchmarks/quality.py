@@ -16,6 +16,7 @@ import statistics
 import sys
 from pathlib import Path
 
+from visdom_plugin.cli.errors import INTERRUPTED
 from visdom_plugin.cli.train import main as visdom_train
 
 COLUMNS = (
@@ -53,7 +54,10 @@ def main() -> int:
                     command = [f"method:{method}", "--views", str(views), "--seed", str(seed), "--quiet"]
                     command += ["--downscale", str(args.downscale), "--out", str(folder), *extra]
                     command += [] if data is None else ["--data", str(data)]
-                    if visdom_train(command) == 0:
+                    status = visdom_train(command)
+                    if status == INTERRUPTED:
+                        return status
+                    if status == 0:
                         records.append(json.loads((folder / "run.json").read_text()))
                     else:
                         failed += 1

@@ -8,6 +8,7 @@ from visdom_plugin.cameras import look_at_camera, project, rays_of
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hooks.regularizer import outside_loss
+from visdom_plugin.hull.raycast import depth_and_silhouette
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.rasterise import rasterise
 
@@ -80,6 +81,20 @@ def test_loss_is_a_pure_function_of_the_generator_and_follows_its_schedule(ball)
     # alpha = 0.5 everywhere: the loss is weight * log 2 * (share of pixels beside the hull).
     share = value(4, 1)["visdom_outside"] / (0.5 * torch.log(torch.tensor(2.0)))
     assert 0.5 < share < 0.95
+
+
+def test_views_of_the_bank_are_the_same_in_every_process(ball):
+    cameras, hull = ball
+    first, second = (VisDomGaussianRegularizer(hull, cameras, bank=5) for _ in range(2))
+    seen = set()
+    for seed in range(40):
+        views = [hook._draw(torch.Generator().manual_seed(seed)) for hook in (first, second)]
+        assert torch.equal(views[0][0].world_from_camera, views[1][0].world_from_camera)
+        assert torch.equal(views[0][1], depth_and_silhouette(hull, views[1][0])[1])
+        seen.add(tuple(views[0][0].centres.tolist()))
+    assert len(seen) == 5
+    fresh = VisDomGaussianRegularizer(hull, cameras, bank=0)
+    assert len({tuple(fresh._draw(None)[0].centres.tolist()) for _ in range(8)}) == 8
 
 
 def test_initial_points_lie_in_the_hull_and_take_the_photographs_colour(ball):

@@ -19,7 +19,10 @@ class RegularizerConfig:
     start: int = 0
     """First step with L_i."""
     views_per_step: int = 1
-    """Interpolated views per loss; each is drawn anew between a random pair of training cameras."""
+    """Interpolated views per loss."""
+    bank: int = 64
+    """Views to draw from, made once, so that the hull's silhouette is cast once for each; 0 draws a new view
+    every time."""
     points: Literal["surface", "volume"] = "surface"
     """Where initial points lie: on the hull's surface, or anywhere inside it."""
     prune_every: int = 0
@@ -39,6 +42,7 @@ class RegularizerConfig:
             every=self.every,
             start=self.start,
             views_per_step=self.views_per_step,
+            bank=self.bank,
             points=self.points,
             prune_every=self.prune_every,
             prune_margin_voxels=self.prune_margin_voxels,

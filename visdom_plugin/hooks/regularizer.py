@@ -48,6 +48,8 @@ class VisDomGaussianRegularizer:
         weight: lambda_3, the weight of L_i; the paper uses 0.01.
         every, start: L_i is added on steps start, start + every, ...
         views_per_step: interpolated views per loss.
+        bank: views to draw from, each made and its silhouette cast once, when first drawn; 0 draws new ones
+            every time. The same for every hook with the same hull and cameras, so that runs can resume.
         points: "surface" draws initial points on the hull's surface, "volume" anywhere inside it.
         prune_every: `after_step` marks Gaussians outside the hull on every n-th step; 0 never.
         prune_margin_voxels: how far outside the hull a centre may lie, in voxels.
@@ -66,6 +68,7 @@ class VisDomGaussianRegularizer:
         every: int = 1,
         start: int = 0,
         views_per_step: int = 1,
+        bank: int = 64,
         points: Literal["surface", "volume"] = "surface",
         prune_every: int = 0,
         prune_margin_voxels: float = 2.0,
@@ -75,13 +78,14 @@ class VisDomGaussianRegularizer:
                 "VisDomGaussianRegularizer needs at least two training cameras to interpolate between",
                 todo="pass the batch of all training cameras",
             )
-        if weight < 0 or every < 1 or views_per_step < 1 or points not in ("surface", "volume"):
+        if weight < 0 or every < 1 or views_per_step < 1 or bank < 0 or points not in ("surface", "volume"):
             raise ConfigError(
-                f"weight={weight}, every={every}, views_per_step={views_per_step}, points={points!r}: "
-                "weight must be >= 0, every and views_per_step >= 1, points 'surface' or 'volume'"
+                f"weight={weight}, every={every}, views_per_step={views_per_step}, bank={bank}, "
+                f"points={points!r}: weight and bank must be >= 0, every and views_per_step >= 1, points 'surface' or 'volume'"
             )
         self.hull, self.cameras, self.images = hull, cameras.to("cpu"), images
         self.weight, self.every, self.start, self.views_per_step = weight, every, start, views_per_step
+        self.bank, self._bank = bank, {}
         self.points, self.prune_every = points, prune_every
         self.prune_margin_voxels = prune_margin_voxels
         self._look_at = torch.as_tensor(hull.centre).to(self.cameras.world_from_camera)
@@ -114,11 +118,21 @@ class VisDomGaussianRegularizer:
             return {}
         total = 0.0
         for _ in range(self.views_per_step):
-            camera = self.sample_camera(generator)
-            _, mask = depth_and_silhouette(self.hull, camera)
+            camera, mask = self._draw(generator)
             alpha = render(camera).alpha
             total = total + outside_loss(alpha, mask.to(alpha.device))
         return {"visdom_outside": self.weight / self.views_per_step * total}
+
+    def _draw(self, generator: Generator | None) -> tuple[Cameras, Tensor]:
+        """A view and the hull's silhouette in it, (H, W) bool."""
+        if not self.bank:
+            camera = self.sample_camera(generator)
+            return camera, depth_and_silhouette(self.hull, camera)[1]
+        index = int(torch.randint(self.bank, (), generator=generator))
+        if index not in self._bank:
+            camera = self.sample_camera(torch.Generator().manual_seed(index))
+            self._bank[index] = camera, depth_and_silhouette(self.hull, camera)[1]
+        return self._bank[index]
 
     def after_step(self, gaussians: Any, step: int) -> Tensor | None:
         """(N,) bool, True for Gaussians the trainer should remove, or None when there is nothing to do."""
