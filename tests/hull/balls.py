@@ -15,7 +15,9 @@ def ring(count: int, distance: float = 4.0, *, size: int = 96, focal: float = 1.
     height = random.uniform(-0.5, 0.6, count)
     flat = np.sqrt(1 - height**2)
     centres = distance * np.stack([flat * np.cos(angle), flat * np.sin(angle), height], -1)
-    motion = look_at_camera(torch.from_numpy(centres), torch.zeros(count, 3).double(), torch.tensor([0.0, 0, 1]).double())
+    motion = look_at_camera(
+        torch.from_numpy(centres), torch.zeros(count, 3).double(), torch.tensor([0.0, 0, 1]).double()
+    )
     intrinsics = torch.tensor([[focal * size, 0, size / 2], [0, focal * size, size / 2], [0, 0, 1]]).double()
     return Cameras.from_matrices(intrinsics.expand(count, 3, 3), motion, width=size, height=size)
 
@@ -29,9 +31,14 @@ def random_cameras(random: np.random.Generator, count: int) -> Cameras:
     width, height = random.integers(20, 70, count), random.integers(20, 70, count)
     intrinsics = np.zeros((count, 3, 3))
     intrinsics[:, 0, 0], intrinsics[:, 1, 1] = random.uniform(10, 120, count), random.uniform(10, 120, count)
-    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = random.uniform(-0.2, 1.2, count) * width, random.uniform(0, 1, count) * height
+    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (
+        random.uniform(-0.2, 1.2, count) * width,
+        random.uniform(0, 1, count) * height,
+    )
     intrinsics[:, 2, 2] = 1
-    return Cameras.from_matrices(intrinsics, motion, width=torch.from_numpy(width), height=torch.from_numpy(height))
+    return Cameras.from_matrices(
+        intrinsics, motion, width=torch.from_numpy(width), height=torch.from_numpy(height)
+    )
 
 
 def random_masks(random: np.random.Generator, cameras: Cameras) -> list[np.ndarray]:

@@ -36,22 +36,26 @@ def test_carve_is_the_dense_vote(kind):
     wanted = dense_carve(gather_silhouettes(cameras, masks), grid_of(hull), keep_rule(domain, 5)).numpy()
     if kind == "unit-sphere":
         centres = np.stack(np.meshgrid(*(grid_of(hull).centres(a) for a in range(3)), indexing="ij"), -1)
-        wanted &= np.linalg.norm(centres - hull.summary["sphere_centre"], axis=-1) <= hull.summary["sphere_radius"]
+        wanted &= (
+            np.linalg.norm(centres - hull.summary["sphere_centre"], axis=-1) <= hull.summary["sphere_radius"]
+        )
     assert np.array_equal(hull.occupancy, wanted) and hull.voxels > 0
 
 
 def test_hulls_of_growing_k_are_nested_before_culling():
     cameras = ring(6)
     masks = ball_masks(cameras, BALLS)
-    box = ((-3.0,) * 3, (3.0,) * 3)
+    box = ((-6.0,) * 3, (6.0,) * 3)
     grids = [
         VisibleDomain(k=k, resolution=60, bounds=box, components="all").carve(cameras, masks).occupancy
         for k in range(1, 7)
     ]
     assert all((b <= a).all() for a, b in zip(grids, grids[1:], strict=False))
-    assert grids[0].sum() > grids[2].sum() > grids[-1].sum()
+    assert grids[0].sum() > grids[1].sum() > grids[-1].sum() > 0
     misses = [
-        VisibleDomain(max_misses=m, resolution=60, bounds=box, components="all").carve(cameras, masks).occupancy
+        VisibleDomain(max_misses=m, resolution=60, bounds=box, components="all")
+        .carve(cameras, masks)
+        .occupancy
         for m in range(3)
     ]
     assert all((a <= b).all() for a, b in zip(misses, misses[1:], strict=False))
@@ -82,26 +86,31 @@ def test_hull_moves_with_the_world(scale):
     assert differ.mean() < 0.05
     near = hull.contains(points, margin_voxels=2) & ~hull.contains(points)
     inner = hull.contains(points) & ~differ
-    assert (other.contains(there, margin_voxels=2) | ~hull.contains(points)).all() and near.any() and inner.any()
+    assert (
+        (other.contains(there, margin_voxels=2) | ~hull.contains(points)).all() and near.any() and inner.any()
+    )
     # The box is right at any scale: the object takes most of its longest side.
     assert (other.extent[1] - other.extent[0]).max() > 0.6 * (other.bounds[1] - other.bounds[0]).max()
 
 
 def test_hull_of_a_ball_approaches_the_ball():
-    cameras = ring(60, size=300)
-    hull = VisibleDomain(resolution=100).carve(cameras, ball_masks(cameras, [((0.2, 0.1, 0), 0.6)]))
+    cameras = ring(40, size=300)
+    hull = VisibleDomain(k="n-1", resolution=100).carve(cameras, ball_masks(cameras, [((0.2, 0.1, 0), 0.6)]))
     exact = 4 / 3 * np.pi * 0.6**3
     # Pixels sampled at their centres may cut half a pixel, 0.3 % of the radius here.
     assert exact * 0.98 < hull.volume < exact * 1.06
     assert np.allclose(hull.centre, [0.2, 0.1, 0], atol=0.02)
 
 
-def test_hull_of_a_box_contains_it_and_fits_where_views_are_square_on():
+def test_hull_of_a_box_contains_it_and_fits():
     cameras = ring(40, distance=30, size=400, focal=9)
-    hull = VisibleDomain(resolution=100).carve(cameras, box_masks(cameras, (-0.5, -0.7, -0.4), (0.6, 0.3, 0.5)))
+    hull = VisibleDomain(k="n-1", resolution=100).carve(
+        cameras, box_masks(cameras, (-0.5, -0.7, -0.4), (0.6, 0.3, 0.5))
+    )
     inner = np.random.default_rng(0).uniform((-0.48, -0.68, -0.38), (0.58, 0.28, 0.48), (5000, 3))
     assert hull.contains(inner).all()
-    assert 1.0 * 1.1 * 0.9 * 0.97 < hull.volume < 1.0 * 1.1 * 0.9 * 1.15
+    exact = 1.1 * 1.0 * 0.9
+    assert 0.97 * exact < hull.volume < 1.15 * exact
 
 
 def test_every_voxel_is_inside_the_masks_of_enough_views():
@@ -120,10 +129,11 @@ def test_every_voxel_is_inside_the_masks_of_enough_views():
 
 def test_a_thin_rod_keeps_its_full_length():
     # Thinner than a cell of every coarse search level, and touching the body.
-    rod = [((x, 0.0, 0.0), 0.02) for x in np.linspace(0.3, 1.3, 120)]
-    cameras = ring(8, size=700)
-    hull = VisibleDomain(resolution=160).carve(cameras, ball_masks(cameras, [((0, 0, 0), 0.35), *rod]))
-    assert hull.extent[1, 0] > 1.28 and hull.bounds[1, 0] > 1.32
+    cameras = ring(8, size=500)
+    body = ball_masks(cameras, [((0, 0, 0), 0.35)])
+    rod = box_masks(cameras, (0.3, -0.02, -0.02), (1.3, 0.02, 0.02))
+    hull = VisibleDomain(resolution=160).carve(cameras, [a | b for a, b in zip(body, rod, strict=True)])
+    assert hull.extent[1, 0] > 1.28 and hull.bounds[1, 0] > 1.3
     assert hull.bounds[1, 0] - hull.bounds[0, 0] < 2.2
 
 
@@ -133,7 +143,9 @@ def test_traditional_box_holds_the_cameras_and_the_ball_clips():
     traditional = replace(SMALL, kind="traditional").carve(cameras, masks)
     centres = cameras.centres.numpy()
     assert (centres > traditional.bounds[0]).all() and (centres < traditional.bounds[1]).all()
-    sphere = replace(SMALL, kind="unit-sphere", sphere_centre=(0.1, 0, 0), sphere_radius=0.9).carve(cameras, masks)
+    sphere = replace(SMALL, kind="unit-sphere", sphere_centre=(0.1, 0, 0), sphere_radius=0.9).carve(
+        cameras, masks
+    )
     vertices, _ = sphere.to_mesh()
     assert np.linalg.norm(vertices - [0.1, 0, 0], axis=1).max() < 0.9 + sphere.voxel_size
     visdom = SMALL.carve(cameras, masks)

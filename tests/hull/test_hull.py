@@ -69,7 +69,7 @@ def test_volume_and_area_of_a_ball_and_a_box():
     box = Hull.from_grid(grid, [[1, 2, 3], [3, 5, 7]])
     assert box.volume == pytest.approx(1.0 * 2.0 * 3.0)
     # Edges are bevelled by half a voxel.
-    assert box.surface_area == pytest.approx(22, rel=0.02) and box.surface_area < 22
+    assert 21 < box.surface_area < 22
     assert np.allclose(box.extent, [[1.2, 2.5, 4], [2.2, 4.5, 7]])
 
 
@@ -142,7 +142,9 @@ def test_from_grid_takes_numbers_and_refuses_nonsense():
 
 def test_save_and_load_round_trip(tmp_path):
     random = np.random.default_rng(0)
-    hull = Hull.from_grid(random.random((5, 6, 7)) < 0.5, [[-1, -2, -3], [4, 4, 4]], {"k": 3, "kind": "visdom"})
+    hull = Hull.from_grid(
+        random.random((5, 6, 7)) < 0.5, [[-1, -2, -3], [4, 4, 4]], {"k": 3, "kind": "visdom"}
+    )
     hull.save(tmp_path / "deep" / "hull.npz")
     back = Hull.load(tmp_path / "deep" / "hull.npz")
     assert back == hull and back.summary == hull.summary and back.occupancy.dtype == bool
@@ -216,7 +218,11 @@ def test_pieces_are_those_of_26_neighbours(seed, fill):
         keep = choose_pieces(pieces.sizes, policy, 0.3)
         left = grid.copy()
         erase_pieces(left, pieces, keep)
-        wanted = {"all": sizes > 0, "largest": sizes == sizes.max(initial=0), "drop-small": sizes >= 0.3 * sizes.max(initial=0)}
+        wanted = {
+            "all": sizes > 0,
+            "largest": sizes == sizes.max(initial=0),
+            "drop-small": sizes >= 0.3 * sizes.max(initial=0),
+        }
         allowed = grid & np.concatenate([[False], wanted[policy]])[labels]
         if policy == "largest":
             assert left.sum() == sizes.max(initial=0) and not (left & ~allowed).any()

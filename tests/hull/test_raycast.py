@@ -33,7 +33,13 @@ def random_hull(random, fill: float) -> Hull:
     shape = random.integers(1, 24, 3)
     grid = random.random(shape) < fill
     if random.random() < 0.5:
-        grid &= random.random(tuple(-(-shape // 6))).repeat(6, 0).repeat(6, 1).repeat(6, 2)[tuple(map(slice, shape))] < 0.3
+        grid &= (
+            random.random(tuple(-(-shape // 6)))
+            .repeat(6, 0)
+            .repeat(6, 1)
+            .repeat(6, 2)[tuple(map(slice, shape))]
+            < 0.3
+        )
     low = random.normal(size=3)
     return Hull.from_grid(grid, np.stack([low, low + shape * random.choice([0.01, 0.3, 2.0])]))
 
@@ -99,7 +105,11 @@ def test_brick_distance_is_the_chessboard_distance(seed):
 def test_an_origin_inside_enters_at_zero():
     hull = Hull.from_grid(np.ones((8, 8, 8), bool), [[0, 0, 0], [8, 8, 8]])
     crossing = cast(hull, torch.full((5, 3), 4.0), torch.eye(3)[[0, 1, 2, 0, 1]] * 2)
-    assert crossing.hit.all() and (crossing.t_first == 0).all() and torch.allclose(crossing.t_last, torch.tensor(2.0))
+    assert (
+        crossing.hit.all()
+        and (crossing.t_first == 0).all()
+        and torch.allclose(crossing.t_last, torch.tensor(2.0))
+    )
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (2, 3), (2, 0)])
@@ -108,7 +118,9 @@ def test_any_leading_shape_and_broadcast(shape):
     directions = torch.ones(*shape, 3)
     crossing = cast(hull, torch.tensor([-3.0, -3, -3]), directions)
     assert crossing.hit.shape == crossing.t_first.shape == shape and crossing.hit.all()
-    assert torch.allclose(crossing.t_first, torch.tensor(2.0)) and torch.allclose(crossing.t_last, torch.tensor(4.0))
+    assert torch.allclose(crossing.t_first, torch.tensor(2.0)) and torch.allclose(
+        crossing.t_last, torch.tensor(4.0)
+    )
 
 
 def test_rays_without_direction_and_nan_miss():

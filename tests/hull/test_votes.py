@@ -99,7 +99,13 @@ def test_agreement_on_the_edge_keeps():
 
 @pytest.mark.parametrize(
     ("views", "agreement", "words"),
-    [(4, 0.95, "not one miss"), (9, 0.95, "not one miss"), (20, 0.95, "one miss is"), (4, 0.74, "one miss is"), (40, 0.95, "2 misses")],
+    [
+        (4, 0.95, "not one miss"),
+        (9, 0.95, "not one miss"),
+        (20, 0.95, "one miss is"),
+        (4, 0.74, "one miss is"),
+        (40, 0.95, "2 misses"),
+    ],
 )
 def test_rule_says_what_agreement_means(views, agreement, words):
     assert words in KeepRule(views, 3, as_fraction(agreement)).meaning()
@@ -131,7 +137,9 @@ def test_dilation_grows_by_a_square():
 
 def test_masks_that_do_not_fit_are_refused():
     cameras = random_cameras(np.random.default_rng(0), 2)
-    good = [np.ones((h, w), bool) for w, h in zip(cameras.width.tolist(), cameras.height.tolist(), strict=True)]
+    good = [
+        np.ones((h, w), bool) for w, h in zip(cameras.width.tolist(), cameras.height.tolist(), strict=True)
+    ]
     for bad in (good[:1], [good[0], good[1].T[:-1]], [good[0] * 255, good[1]]):
         with pytest.raises(SceneError):
             gather_silhouettes(cameras, bad)

@@ -124,7 +124,7 @@ def _place(domain: VisibleDomain, cameras, silhouettes, rule: KeepRule, areas):
     ball_given = domain.sphere_centre is not None and domain.sphere_radius is not None
     region = None
     if given is None or (needs_ball and not ball_given):
-        drop = domain.min_component_fraction if domain.components != "all" else 0.0
+        drop = {"all": 0.0, "largest": 0.5}.get(domain.components, domain.min_component_fraction)
         region = _visible_region(domain, cameras, silhouettes, rule, areas, drop)
         if region is None:
             return None

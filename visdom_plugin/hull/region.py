@@ -23,12 +23,17 @@ _START = 32
 """Cells along a side of the first cube."""
 _FINEST = 64
 """Cells along the found box's longest side when the search ends: its faces are known to about 1.5 %."""
+_SLACK = 1.2
+"""How much longer the box may be than that of the cells whose centres are kept."""
+_WIDE = 512
+"""Cells across the kept centres at which parts thinner than a cell no longer count."""
 _MOST_CELLS = 3_000_000
 _MOST_LABELS = 1 << 24
 _MOST_SIDE = 1 << 15
 _ENOUGH = 1000
-"""Cells inside the region from which the volumes of its pieces can be compared; eight times as many settle it."""
-_DOUBLINGS = 4
+"""Cells inside the region from which the volumes of its pieces can be compared."""
+_DOUBLINGS, _PATIENCE = 4, 2
+"""How often the first cube is doubled while it is empty, and while the region touches its faces."""
 MARGIN_VOXELS = 2
 """Empty voxels between the region and the faces of the grid."""
 
@@ -47,9 +52,9 @@ def find_region(
 ) -> Region | None:
     """The smallest box known to hold the rule's region, or None when no point can satisfy the rule.
 
-    The first cube reaches twice as far from the look-at point as the farthest camera. While the region touches
-    its faces, or is empty, the cube is doubled, up to 16 times; a region that still touches is open, and is
-    clipped to the first cube that holds any of it.
+    The first cube reaches twice as far from the look-at point as the farthest camera. The cube is doubled up to
+    four times while it holds nothing, and up to twice while the region touches its faces; a region that still
+    touches is open, and is clipped to the first cube that holds any of it.
 
     Args:
         drop_below: leave out pieces with clearly less than this fraction of the largest piece's volume; 0 keeps
@@ -72,6 +77,8 @@ def find_region(
             return Region(box, True)
         if first is None:
             first = box
+        elif doubling >= _PATIENCE:
+            break
     return None if first is None else Region(first, False)
 
 
@@ -93,28 +100,36 @@ def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, drop_below: float):
     settled = np.zeros((0, 3), np.int64)
     while True:
         states = classify_cells(silhouettes, areas, grid, rule, cells)
-        settled = np.concatenate([settled, cells[states == KEPT]])
         mixed = cells[states == MIXED]
-        resolved = True
-        inside = keep_centres(silhouettes, grid, rule, mixed)
-        volume = len(settled) + inside.sum()
-        if drop_below and len(mixed):
-            resolved = volume >= 8 * _ENOUGH
-            if volume >= _ENOUGH:
-                settled, mixed, alone = _drop_small(settled, mixed, inside, drop_below)
-                resolved = resolved or alone
-        finest = grid.shape[0] >= _MOST_SIDE
+        cells = np.concatenate([settled, cells[states == KEPT], mixed])
+        inside = np.ones(len(cells), bool)
+        whole = len(cells) - len(mixed)
+        inside[whole:] = keep_centres(silhouettes, grid, rule, mixed)
+        if drop_below and inside.sum() >= _ENOUGH:
+            stays = _large_pieces(cells, inside, drop_below)
+            whole = int(stays[:whole].sum())
+            cells, inside = cells[stays], inside[stays]
+        last = grid.shape[0] >= _MOST_SIDE or 8 * (len(cells) - whole) > _MOST_CELLS
         # Corners of several frusta stay undecided in cells of any size.
-        if len(settled) + len(mixed) == 0 or (finest and volume == 0):
+        if len(cells) == 0 or (last and not inside.any()):
             return None
-        both = np.concatenate([settled, mixed])
-        low, high = both.min(0), both.max(0) + 1
-        fine = (high - low).max() >= _FINEST and resolved
-        if fine or finest or 8 * len(mixed) > _MOST_CELLS or not len(mixed):
-            box = grid.lower + np.stack([low, high]) * grid.voxel
-            return box, bool((low == 0).any() or (high == np.array(grid.shape)).any())
+        box = _box_of(cells)
+        surely = _box_of(cells[inside]) if inside.any() else None
+        across = 0 if surely is None else (surely[1] - surely[0]).max()
+        # Slivers where a few frusta meet inflate the box until the cells are small enough to tell.
+        tight = (box[1] - box[0]).max() <= _SLACK * across
+        if not tight and across >= _WIDE:
+            box, tight = surely + np.array([[-4], [4]]), True
+        if (tight and across >= _FINEST) or last or len(cells) == whole:
+            touches = bool((box[0] <= 0).any() or (box[1] >= np.array(grid.shape)).any())
+            return grid.lower + box * grid.voxel, touches
         grid = Grid(grid.lower, grid.voxel / 2, tuple(2 * n for n in grid.shape))
-        cells, settled = (_split(x) for x in (mixed, settled))
+        settled, cells = _split(cells[:whole]), _split(cells[whole:])
+
+
+def _box_of(cells: np.ndarray) -> np.ndarray:
+    """(2, 3) first and one past the last index."""
+    return np.stack([cells.min(0), cells.max(0) + 1])
 
 
 def _split(cells: np.ndarray) -> np.ndarray:
@@ -123,34 +138,28 @@ def _split(cells: np.ndarray) -> np.ndarray:
     return (2 * cells[:, None] + corners).reshape(-1, 3)
 
 
-def _drop_small(settled: np.ndarray, mixed: np.ndarray, inside: np.ndarray, fraction: float):
-    """Leaves out pieces whose volume, estimated from cell centres, is clearly below `fraction` of the largest's.
+def _large_pieces(cells: np.ndarray, inside: np.ndarray, fraction: float) -> np.ndarray:
+    """(M,) bool: cells of pieces whose volume is not clearly below `fraction` of the largest's.
 
-    Pieces are joined through every cell that may hold a part of the region, however thin.
+    Pieces are joined through every cell that may hold a part of the region, however thin; their volumes are
+    estimated from the cells' centres.
 
     Args:
-        settled, mixed: (M, 3) cells kept whole, and cells kept perhaps in part.
-        inside: (M,) bool, the mixed cells whose centre is kept.
-
-    Returns:
-        settled, mixed, and whether one piece is certain to be all that stays.
+        cells: (M, 3) that the rule may keep.
+        inside: (M,) bool, those kept whole or with their centre.
     """
-    both = np.concatenate([settled, mixed])
-    low, size = both.min(0), np.ptp(both, axis=0) + 1
+    low, high = _box_of(cells)
     # Labels on a coarser grid may join pieces, which can only keep more of them.
     shift = 0
-    while np.prod(((size - 1) >> shift) + 1) > _MOST_LABELS:
+    while np.prod(((high - low - 1) >> shift) + 1) > _MOST_LABELS:
         shift += 1
-    where = (both - low) >> shift
-    grid = np.zeros(((size - 1) >> shift) + 1, bool)
+    where = (cells - low) >> shift
+    grid = np.zeros(((high - low - 1) >> shift) + 1, bool)
     grid[tuple(where.T)] = True
     pieces = find_pieces(grid)
     labels = piece_of(where, grid.shape, pieces)
-    counted = np.concatenate([np.ones(len(settled), bool), inside])
-    volumes = np.bincount(labels, weights=counted, minlength=len(pieces.sizes))
-    keep = volumes >= 0.9 * fraction * volumes.max()
-    stays = keep[labels]
-    return settled[stays[: len(settled)]], mixed[stays[len(settled) :]], shift == 0 and keep.sum() == 1
+    volumes = np.bincount(labels, weights=inside, minlength=len(pieces.sizes))
+    return (volumes >= 0.9 * fraction * volumes.max())[labels]
 
 
 def cube_around(box: np.ndarray, resolution: int) -> Grid:
