@@ -131,11 +131,15 @@ def test_seeds_differ_and_repeat(scene, hull):
 def test_extent_and_colour_agree_with_their_definitions(scene):
     cameras = scene.train.cameras
     mean = sum(cameras.centres) / len(cameras)
-    assert scene_extent(cameras) == pytest.approx(1.1 * max(float((c - mean).norm()) for c in cameras.centres))
+    assert scene_extent(cameras) == pytest.approx(
+        1.1 * max(float((c - mean).norm()) for c in cameras.centres)
+    )
     # A point far behind every camera is seen by none: black.
     assert (mean_masked_colour(torch.full((1, 3), 1e6), scene.train) >= 0).all()
     behind = cameras.centres[0] - 1e3 * cameras.forward[0]
-    one = replace(scene.train, cameras=cameras[:1], images=scene.train.images[:1], names=scene.train.names[:1])
+    one = replace(
+        scene.train, cameras=cameras[:1], images=scene.train.images[:1], names=scene.train.names[:1]
+    )
     assert (mean_masked_colour(behind[None].float(), one) == 0).all()
 
 
@@ -145,5 +149,5 @@ def test_presets_differ_only_in_what_they_name():
         base = getattr(bare, budget)
         assert replace(getattr(mask, budget), mask_weight=base.mask_weight) == base
         assert getattr(vd, budget).vd.enabled and not base.vd.enabled
-        undone = replace(getattr(vd, budget), mask_weight=base.mask_weight, hull=base.hull, vd=base.vd)
-        assert undone == base
+        kept = {name: getattr(base, name) for name in ("mask_weight", "hull", "vd", "floater_every")}
+        assert replace(getattr(vd, budget), **kept) == base

@@ -23,9 +23,9 @@ class RegularizerConfig:
     bank: int = 64
     """Views to draw from, made once, so that the hull's silhouette is cast once for each; 0 draws a new view
     every time."""
-    points: Literal["surface", "volume"] = "surface"
-    """Where initial points lie: on the hull's surface, or anywhere inside it."""
-    prune_every: int = 0
+    points: Literal["surface", "volume"] = "volume"
+    """Where initial points lie: on the hull's surface, or anywhere inside it, where the object is."""
+    prune_every: int = 50
     """Remove Gaussians whose centres lie outside the hull on every n-th step; 0 leaves them to L_i."""
     prune_margin_voxels: float = 2.0
     """How far outside the hull a centre may lie before it is removed, in voxels of the hull's grid."""

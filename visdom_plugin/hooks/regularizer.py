@@ -69,7 +69,7 @@ class VisDomGaussianRegularizer:
         start: int = 0,
         views_per_step: int = 1,
         bank: int = 64,
-        points: Literal["surface", "volume"] = "surface",
+        points: Literal["surface", "volume"] = "volume",
         prune_every: int = 0,
         prune_margin_voxels: float = 2.0,
     ):
@@ -81,7 +81,8 @@ class VisDomGaussianRegularizer:
         if weight < 0 or every < 1 or views_per_step < 1 or bank < 0 or points not in ("surface", "volume"):
             raise ConfigError(
                 f"weight={weight}, every={every}, views_per_step={views_per_step}, bank={bank}, "
-                f"points={points!r}: weight and bank must be >= 0, every and views_per_step >= 1, points 'surface' or 'volume'"
+                f"points={points!r}: weight and bank must be >= 0, every and views_per_step >= 1, "
+                "points 'surface' or 'volume'"
             )
         self.hull, self.cameras, self.images = hull, cameras.to("cpu"), images
         self.weight, self.every, self.start, self.views_per_step = weight, every, start, views_per_step
