@@ -29,7 +29,9 @@ COLUMNS = (
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", nargs="*", default=[None], help="scene folders; none is the built-in scene")
     parser.add_argument("--views", nargs="+", type=int, default=[4])
     parser.add_argument("--methods", nargs="+", default=["3dgs-go", "3dgs-go+mask", "3dgs-go+vd"])

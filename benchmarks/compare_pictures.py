@@ -1,0 +1,54 @@
+"""One sheet of test views, a row per finished run and the truth on top.
+
+    python benchmarks/compare_pictures.py --out docs/built_in_4_views.png \
+        runs/quality/built-in/4/3dgs-go/0 runs/quality/built-in/4/3dgs-go+mask/0 runs/quality/built-in/4/3dgs-go+vd/0
+
+The runs must be of one scene; the truth is loaded as the first run's was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from datamodules import load
+from visdom_plugin.cli.errors import run
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.training.metrics import whiten
+from visdom_plugin.training.pictures import draw_sheet, picture_names, to_bytes, write_png
+from visdom_plugin.training.rundir import read_record
+
+
+def main(argv: list[str]) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--count", type=int, default=5, help="test views shown, evenly spaced")
+    args = parser.parse_args(argv)
+    records = [read_record(path) for path in args.runs]
+    data = records[0]["data"]
+    if any(record["data"]["test"] != data["test"] for record in records):
+        raise ConfigError("the runs have different test views", todo="name runs of one scene")
+    scene = load(data["path"], views=data["views"], downscale=data["downscale"], seed=data.get("seed", 0))
+    names = picture_names(scene.test.names)
+    columns = []
+    for i in np.linspace(0, len(names) - 1, min(args.count, len(names))).round().astype(int):
+        pictures = [to_bytes(whiten(scene.test.images[i], scene.test.masks[i]))]
+        for path in args.runs:
+            image = cv2.imread(str(path / "renders" / "test" / f"{names[i]}.png"))
+            if image is None:
+                raise ConfigError(f"{path} has no picture of {names[i]}", todo="run visdom-eval on it")
+            pictures.append(image[..., ::-1])
+        columns.append((names[i], pictures))
+    rows = ["truth", *(record["method"].removeprefix("3dgs-go") or "bare" for record in records)]
+    write_png(args.out, draw_sheet(columns, rows))
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))
