@@ -43,23 +43,32 @@ def test_k_above_the_number_of_views(capture):
 
 
 def test_k_above_co_visibility():
-    # Each view's window shows another part, so that no point is seen by more than four.
-    cameras = ring(6, size=120)
+    # Two of six cameras look away from the object; a speck keeps their masks from being empty.
+    cameras = ring(6)
     masks = ball_masks(cameras, [((0, 0, 0), 0.35)])
-    turned = cameras.intrinsics.clone()
-    turned[:2, 0, 2] -= 400
-    cameras = replace(cameras, intrinsics=turned)
-    masks = [torch.zeros_like(m) if i < 2 else m for i, m in enumerate(masks)]
+    motion = cameras.world_from_camera.clone()
+    motion[:2] = motion[:2] @ torch.diag(torch.tensor([-1.0, 1, -1, 1])).double()
     for i in range(2):
-        masks[i][0, 0] = True
-    error = cause_of(replace(SMALL, k=5), cameras, masks)
+        masks[i] = torch.zeros_like(masks[i])
+        masks[i][40:44, 40:44] = True
+    error = cause_of(replace(SMALL, k=5), replace(cameras, world_from_camera=motion), masks)
     assert "co-visibility" in error.cause and "-k 4" in error.todo
 
 
-def test_one_inverted_mask(capture):
+def test_inverted_masks(capture):
     cameras, masks = capture
-    error = cause_of(SMALL, cameras, [~masks[0], *masks[1:]])
+    box = ((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1))
+    inside = replace(SMALL, bounds=box)
+    error = cause_of(inside, cameras, [~masks[0], *masks[1:]])
     assert "inverted" in error.cause and error.where == "view 0"
+    error = cause_of(inside, cameras, [~m for m in masks])
+    assert "inverted" in error.cause and "True (white)" in error.todo
+
+
+def test_inverted_masks_that_leave_a_hull_are_warned_about(capture, caplog):
+    cameras, masks = capture
+    SMALL.carve(cameras, [~m for m in masks])
+    assert "mark the background" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -131,9 +140,9 @@ def test_a_shrunken_mask_and_a_cut_object_are_found(capture):
     assert any(text.startswith("b:") for text in found.findings) or any(
         "covers only" in t for t in found.findings
     )
-    near = ring(6, distance=1.6, seed=3)
+    near = ring(6, distance=1.3, seed=3)
     cut = box_masks(near, *BOX)
-    assert all(border_share(m.numpy()) > 0 for m in cut)
+    assert any(border_share(m.numpy()) > 0 for m in cut)
     assert any("border" in text for text in diagnose(SMALL, SMALL.carve(near, cut), near, cut).findings)
 
 

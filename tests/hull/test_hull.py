@@ -1,5 +1,6 @@
 """The grid, its mesh, its points and its files."""
 
+import contextlib
 import copy
 import pickle
 
@@ -161,10 +162,8 @@ def test_damaged_files_are_refused(tmp_path):
             Hull.load(path)
     for at in range(30, len(whole), 97):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 255]) + whole[at + 1 :])
-        try:
+        with contextlib.suppress(CheckpointError):
             assert Hull.load(path) == ball(12)
-        except CheckpointError:
-            pass
     np.savez(path, other=np.zeros(3))
     with pytest.raises(CheckpointError):
         Hull.load(path)

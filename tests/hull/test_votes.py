@@ -31,13 +31,13 @@ def random_case(seed: int):
     views = int(random.integers(1, 9))
     cameras = random_cameras(random, views)
     masks = random_masks(random, cameras)
-    shape = tuple(int(n) for n in random.integers(3, 75, 3))
+    shape = tuple(int(n) for n in random.integers(3, 60, 3))
     grid = Grid(random.normal(size=3) - 1, float(random.choice([0.01, 0.04, 0.3])), shape)
     return random, cameras, masks, grid, random_rule(random, views)
 
 
 @given(st.integers(0, 10**9))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_blocks_equal_dense_vote(seed):
     _, cameras, masks, grid, rule = random_case(seed)
     silhouettes = gather_silhouettes(cameras, masks)

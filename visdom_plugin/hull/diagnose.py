@@ -33,6 +33,8 @@ class Coverage(NamedTuple):
     """Share of the mask's pixels that the hull covers; 1 for an empty mask."""
     inside: float
     """Share of the hull's silhouette that lies on the mask; 1 where the hull is not seen."""
+    seen: bool = True
+    """Whether the view sees the hull at all."""
 
 
 class ViewReport(NamedTuple):
@@ -79,7 +81,9 @@ def measure_coverage(hull: Hull, cameras: Cameras, masks: Sequence) -> list[Cove
         _, seen = depth_and_silhouette(hull, cameras[view].to("cpu"))
         seen, mask = seen.numpy(), np.asarray(mask.cpu() if hasattr(mask, "cpu") else mask).astype(bool)
         both, of_mask, of_hull = (int(np.count_nonzero(x)) for x in (seen & mask, mask, seen))
-        result.append(Coverage(both / of_mask if of_mask else 1.0, both / of_hull if of_hull else 1.0))
+        result.append(
+            Coverage(both / of_mask if of_mask else 1.0, both / of_hull if of_hull else 1.0, of_hull > 0)
+        )
     return result
 
 
@@ -100,7 +104,7 @@ def diagnose(
     removed = leave_one_out(silhouettes, grid, rule)
     coverage = measure_coverage(hull, cameras, [silhouettes.mask(i) for i in range(len(silhouettes))])
     views = [
-        ViewReport(*coverage[i], border_share(silhouettes.mask(i)), removed[i])
+        ViewReport(*coverage[i][:2], border_share(silhouettes.mask(i)), removed[i])
         for i in range(len(silhouettes))
     ]
     per_k = votes_per_k(silhouettes, grid, domain)

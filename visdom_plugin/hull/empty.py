@@ -23,8 +23,8 @@ _CONVINCING = 0.9
 def explain_empty(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes) -> EmptyHullError:
     """The error for an empty hull, with the likeliest cause if one of these could be established.
 
-    In this order: empty masks; K above the number of views; explicit bounds or a ball beside the hull; inverted
-    masks; poses in another convention; K above what the views see in common; a single view that disagrees.
+    In this order: empty masks; K above the number of views; inverted masks; explicit bounds or a ball beside the
+    hull; poses in another convention; K above what the views see in common; a single view that disagrees.
     """
     views = len(silhouettes)
     rule = keep_rule(domain, views)
@@ -34,8 +34,8 @@ def explain_empty(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouet
     for suspect in (
         _empty_masks,
         _too_few_views,
-        _beside,
         _inverted,
+        _beside,
         _convention,
         _covisibility,
         _single_view,
@@ -56,12 +56,13 @@ def _list(views: Sequence[int]) -> str:
 
 
 def _try(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes) -> float:
-    """Mean share of the masks that a coarse hull covers, 0 without one."""
+    """Mean share that a coarse hull covers of the masks of the views that see it, 0 without one."""
     hull = carve_silhouettes(replace(domain, resolution=COARSE), cameras, silhouettes)
     if hull is None:
         return 0.0
     masks = [silhouettes.mask(i) for i in range(len(silhouettes))]
-    return float(np.mean([c.covered for c in measure_coverage(hull, cameras, masks)]))
+    shares = [c.covered for c in measure_coverage(hull, cameras, masks) if c.seen]
+    return float(np.mean(shares)) if shares else 0.0
 
 
 def _empty_masks(domain, cameras, silhouettes):
@@ -87,7 +88,7 @@ def _beside(domain, cameras, silhouettes):
     if domain.bounds is not None:
         free = replace(domain, bounds=None)
         hull = carve_silhouettes(replace(free, resolution=COARSE), cameras, silhouettes)
-        if hull is not None:
+        if hull is not None and _try(free, cameras, silhouettes) >= _CONVINCING:
             low, high = np.round(hull.extent, 4).tolist()
             return (
                 f"the given bounds miss the hull, which lies in {low} .. {high}",
@@ -96,7 +97,7 @@ def _beside(domain, cameras, silhouettes):
             )
     if domain.kind == "unit-sphere" and (domain.sphere_centre or domain.sphere_radius):
         free = replace(domain, sphere_centre=None, sphere_radius=None)
-        if _try(free, cameras, silhouettes) > 0:
+        if _try(free, cameras, silhouettes) >= _CONVINCING:
             return "the given ball misses the hull", "drop sphere_centre and sphere_radius", "sphere_centre"
     return None
 
@@ -109,7 +110,7 @@ def _inverted(domain, cameras, silhouettes):
     turned = replace(silhouettes, pixels=pixels)
     for i in flagged:
         turned.mask(i)[:] ^= 1
-    if _try(domain, cameras, turned) < _CONVINCING:
+    if _try(replace(domain, bounds=None), cameras, turned) < _CONVINCING:
         return None
     whose = "the masks" if len(flagged) == len(silhouettes) else f"the masks of {_list(flagged)}"
     cause = f"{whose} are inverted: they mark the background; turned over, the hull is not empty"

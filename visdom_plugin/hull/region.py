@@ -27,7 +27,8 @@ _SLACK = 1.2
 """How much longer the box may be than that of the cells whose centres are kept."""
 _WIDE = 512
 """Cells across the kept centres at which parts thinner than a cell no longer count."""
-_MOST_CELLS = 3_000_000
+_MOST_CELLS, _MOST_EMPTY = 3_000_000, 400_000
+"""Cells to judge at once, and as long as no centre is kept."""
 _MOST_LABELS = 1 << 24
 _MOST_SIDE = 1 << 15
 _ENOUGH = 1000
@@ -109,7 +110,8 @@ def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, drop_below: float):
             stays = _large_pieces(cells, inside, drop_below)
             whole = int(stays[:whole].sum())
             cells, inside = cells[stays], inside[stays]
-        last = grid.shape[0] >= _MOST_SIDE or 8 * (len(cells) - whole) > _MOST_CELLS
+        most = _MOST_CELLS if inside.any() else _MOST_EMPTY
+        last = grid.shape[0] >= _MOST_SIDE or 8 * (len(cells) - whole) > most
         # Corners of several frusta stay undecided in cells of any size.
         if len(cells) == 0 or (last and not inside.any()):
             return None
