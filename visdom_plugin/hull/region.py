@@ -27,7 +27,7 @@ _SLACK = 1.2
 """How much longer the box may be than that of the cells whose centres are kept."""
 _WIDE = 512
 """Cells across the kept centres at which parts thinner than a cell no longer count."""
-_MOST_CELLS, _MOST_EMPTY = 3_000_000, 400_000
+_MOST_CELLS, _MOST_EMPTY = 2_000_000, 400_000
 """Cells to judge at once, and as long as no centre is kept."""
 _MOST_LABELS = 1 << 24
 _MOST_SIDE = 1 << 15
