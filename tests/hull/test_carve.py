@@ -159,6 +159,14 @@ def test_traditional_box_holds_the_cameras_and_the_ball_clips():
     assert replace(SMALL, kind="unit-sphere").carve(cameras, masks).contains(points, margin_voxels=1).all()
 
 
+def test_k_of_one_is_the_traditional_hull():
+    cameras = ring(5)
+    masks = ball_masks(cameras, BALLS)
+    assert replace(SMALL, k=1).carve(cameras, masks) == replace(SMALL, kind="traditional").carve(
+        cameras, masks
+    )
+
+
 def test_small_pieces_are_dropped():
     cameras = ring(8)
     masks = ball_masks(cameras, [((0, 0, 0), 0.5), ((0.9, 0, 0), 0.1)])

@@ -140,17 +140,23 @@ def _place(domain: VisibleDomain, cameras, silhouettes, rule: KeepRule, areas):
     box = region.bounds
     if ball is not None:
         box = np.stack([ball[0] - ball[1], ball[0] + ball[1]])
-    elif domain.kind == "traditional":
+    elif _one_view_is_enough(domain, rule):
         centres = cameras.centres.double().cpu().numpy()
         box = np.stack([np.minimum(box[0], centres.min(0)), np.maximum(box[1], centres.max(0))])
     return cube_around(box, domain.resolution), ball, closed
 
 
+def _one_view_is_enough(domain: VisibleDomain, rule: KeepRule) -> bool:
+    return domain.kind == "traditional" or (domain.kind == "visdom" and rule.least_visible == 1)
+
+
 def _visible_region(domain, cameras, silhouettes, rule: KeepRule, areas, drop: float) -> Region | None:
-    if domain.kind in ("visdom", "released-go"):
+    if domain.kind == "released-go" or (domain.kind == "visdom" and rule.least_visible > 1):
         return find_region(cameras, silhouettes, rule, drop_below=drop, areas=areas)
     views = len(silhouettes)
-    start = keep_rule(replace(domain, kind="visdom"), views).least_visible
+    start = 3 if domain.k == "auto" else keep_rule(replace(domain, kind="visdom"), views).least_visible
+    # With K = 1 the views close nothing: the box is that of the usual K.
+    start = 3 if start == 1 else start
     for k in range(min(start, views), 0, -1):
         region = find_region(
             cameras, silhouettes, rule._replace(least_visible=k), drop_below=drop, areas=areas

@@ -28,8 +28,9 @@ class VisibleDomain:
     of the N masks, visibility not counted (points behind a camera are never inside its mask here).
 
     Automatic bounds are a cube of resolution ** 3 voxels around the space that can satisfy the rule, found from
-    cameras and masks alone. The traditional hull reaches as far as any single camera sees; its cube holds the
-    visible domain (with `k`, or the largest smaller one that leaves any) and all camera centres. The default
+    cameras and masks alone. The traditional hull, and "visdom" with k = 1, reach as far as any single camera
+    sees; their cube holds the visible domain (of `k`, of 3 where that is 1, or of the largest smaller one that
+    leaves any) and all camera centres. The default
     ball is centred on the visible domain's box and reaches its corners, and the cube holds the ball.
     """
 

@@ -27,13 +27,13 @@ _SLACK = 1.2
 """How much longer the box may be than that of the cells whose centres are kept."""
 _WIDE = 512
 """Cells across the kept centres at which parts thinner than a cell no longer count."""
-_MOST_CELLS, _MOST_EMPTY = 2_000_000, 400_000
+_MOST_CELLS, _MOST_EMPTY = 2_000_000, 200_000
 """Cells to judge at once, and as long as no centre is kept."""
 _MOST_LABELS = 1 << 24
 _MOST_SIDE = 1 << 15
 _ENOUGH = 1000
 """Cells inside the region from which the volumes of its pieces can be compared."""
-_DOUBLINGS, _PATIENCE = 4, 2
+_DOUBLINGS, _PATIENCE = 3, 2
 """How often the first cube is doubled while it is empty, and while the region touches its faces."""
 MARGIN_VOXELS = 2
 """Empty voxels between the region and the faces of the grid."""
@@ -54,7 +54,7 @@ def find_region(
     """The smallest box known to hold the rule's region, or None when no point can satisfy the rule.
 
     The first cube reaches twice as far from the look-at point as the farthest camera. The cube is doubled up to
-    four times while it holds nothing, and up to twice while the region touches its faces; a region that still
+    three times while it holds nothing, and up to twice while the region touches its faces; a region that still
     touches is open, and is clipped to the first cube that holds any of it.
 
     Args:
