@@ -154,7 +154,7 @@ def _visible_region(domain, cameras, silhouettes, rule: KeepRule, areas, drop: f
     if domain.kind == "released-go" or (domain.kind == "visdom" and rule.least_visible > 1):
         return find_region(cameras, silhouettes, rule, drop_below=drop, areas=areas)
     views = len(silhouettes)
-    start = 3 if domain.k == "auto" else keep_rule(replace(domain, kind="visdom"), views).least_visible
+    start = keep_rule(replace(domain, kind="visdom"), views).least_visible
     # With K = 1 the views close nothing: the box is that of the usual K.
     start = 3 if start == 1 else start
     for k in range(min(start, views), 0, -1):
