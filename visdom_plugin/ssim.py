@@ -95,7 +95,7 @@ class _Ssim(torch.autograd.Function):
         return torch.from_numpy(out).reshape(x.shape), None, None
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
 def _blur_across(padded, channels, window, out):
     """Blurs one row (W C,) given with RADIUS pixels of zeros on both sides."""
     for j in range(len(out)):
@@ -106,7 +106,7 @@ def _blur_across(padded, channels, window, out):
             out[j] += weight * source[j]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
 def _add_products(x, y, weight, mx, my, xx, yy, xy):
     for j in range(len(x)):
         a, b = x[j], y[j]
@@ -118,7 +118,7 @@ def _add_products(x, y, weight, mx, my, xx, yy, xy):
         xy[j] += wa * b
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
 def _compare(maps):
     """Sum of the similarity over one row; turns the first three rows of `maps` into its derivatives."""
     real = maps.dtype.type

@@ -15,6 +15,10 @@ from numba.extending import intrinsic, overload
 
 # Sums may be regrouped into vector lanes (the compiled order is fixed, so results repeat to the bit), but NaN
 # and infinity keep their meaning.
+#
+# A function with these flags is always inlined (`forceinline`). Otherwise the process that compiles it calls the
+# copy compiled by itself, and every later process, which loads the caller from numba's cache, the copy optimised
+# once more inside the caller: the last bits would differ between a machine's first run and all others.
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
@@ -31,7 +35,7 @@ def exp_negative(x):
     raise NotImplementedError("compiled code only")
 
 
-@overload(exp_negative, jit_options={"fastmath": FAST, "error_model": "numpy"})
+@overload(exp_negative, jit_options={"fastmath": FAST, "error_model": "numpy", "forceinline": True})
 def _exp_negative(x):
     if x != types.float32:
         return lambda x: math.exp(-x)

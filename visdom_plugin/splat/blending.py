@@ -31,7 +31,7 @@ CHECK_EVERY = 16
 """Gaussians between two looks at which rows are still being drawn."""
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
 def _draw(s, p0, p1, place, u, v, a, b, c, opacity, red, green, blue, z):
     """Blends one Gaussian into pixels p0 .. p1 - 1. A pixel that is done has its T negated."""
     real = s.dtype.type
@@ -125,7 +125,7 @@ def blend(
                 last[y, x] = np.int32(s[p + LAST])
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
 def _differentiate(s, p0, p1, place, u, v, a, b, c, opacity, red, green, blue, z):
     """Takes one Gaussian off pixels p0 .. p1 - 1 again; returns its sums of gradients, in moments of the offset.
 
