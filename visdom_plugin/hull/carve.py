@@ -37,6 +37,7 @@ def carve(domain: VisibleDomain, cameras: Cameras, masks: Sequence) -> Hull:
     from visdom_plugin.hull.diagnose import choose_k, look_inverted
     from visdom_plugin.hull.empty import explain_empty
 
+    log.info("carving the hull (the first time on a machine its kernels are compiled: 10 to 30 s)")
     silhouettes = gather_silhouettes(cameras, masks, domain.dilate_px)
     asked = domain.k
     if domain.k == "auto" and domain.kind != "released-go":
