@@ -1,0 +1,48 @@
+"""The hash encoding in plain torch operations: any device, any dtype, the reference of the fast versions."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from visdom_plugin.nerf.hash_layout import PRIMES, HashLayout
+
+BITS = 0xFFFFFFFF
+
+
+def encode_torch(points: Tensor, table: Tensor, layout: HashLayout) -> Tensor:
+    """(..., 3) -> (..., levels, features). See `hash_grid.encode`."""
+    points = points.detach().clamp(0, 1)
+    return torch.stack([_level(points, table, layout, level) for level in range(layout.levels)], -2)
+
+
+def encode_mean_torch(points: Tensor, scales: Tensor, table: Tensor, layout: HashLayout):
+    """(..., S, 3), (..., S) -> (..., levels, features), (..., levels). See `hash_grid.encode_mean`."""
+    resolutions = torch.tensor(layout.resolutions, dtype=points.dtype, device=points.device)
+    weights = torch.erf(1 / (math.sqrt(8) * scales.detach()[..., None] * resolutions))
+    features = encode_torch(points, table, layout)
+    return (weights[..., None] * features).mean(-3), weights.mean(-2)
+
+
+def _level(points: Tensor, table: Tensor, layout: HashLayout, level: int) -> Tensor:
+    """(..., features) of one level."""
+    resolution, offset = layout.resolutions[level], layout.offsets[level]
+    position = points * resolution
+    cell = position.floor().clamp(max=resolution - 1)
+    fraction = position - cell
+    cell = cell.long()
+    total = 0
+    for corner in range(8):
+        bits = [(corner >> axis) & 1 for axis in range(3)]
+        x, y, z = (cell[..., axis] + bits[axis] for axis in range(3))
+        if layout.dense[level]:
+            row = x + (resolution + 1) * (y + (resolution + 1) * z)
+        else:
+            row = ((x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])) & BITS & (layout.sizes[level] - 1)
+        weight = 1
+        for axis in range(3):
+            weight = weight * (fraction[..., axis] if bits[axis] else 1 - fraction[..., axis])
+        total = total + weight[..., None] * table[offset + row]
+    return total
