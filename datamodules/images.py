@@ -14,6 +14,7 @@ from typing import NoReturn
 
 import numpy as np
 
+from datamodules.paths import read_plain
 from visdom_plugin.errors import SceneError
 
 MAX_PIXELS = 2**28
@@ -29,14 +30,14 @@ def read_file(path: Path) -> bytes:
         SceneError: it is missing or cannot be read.
     """
     try:
-        return path.read_bytes()
+        return read_plain(path)
     except FileNotFoundError:
         raise SceneError(
             "an image file is missing", where=path, todo="copy it there, or take the view off the index files"
         ) from None
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise SceneError(
-            f"an image file cannot be read: {error.strerror}",
+            f"an image file cannot be read: {getattr(error, 'strerror', None) or error}",
             where=path,
             todo="make it a plain file that you may read",
         ) from error

@@ -1,36 +1,62 @@
-"""Paths that the data names: no file outside the data folder is read because a data file says so."""
+"""Paths that the data names: no file outside the data folder is read because a data file says so.
+
+Files are opened without waiting and only when they are plain files: a pipe or a device in a scene's place
+would otherwise hang the reader or never end.
+"""
 
 from __future__ import annotations
 
+import os
+import stat
 from pathlib import Path, PurePosixPath
 
 from visdom_plugin.errors import SceneError
 
+MOST_BYTES = 2**31
+"""No single file of a scene is larger; its bytes are held in memory while it is read."""
+_OPTION = "pass --allow-outside if you trust this data"
 
-def check_name(relative: str, where: Path) -> None:
-    """Refuses names in the data that are absolute, climb out of their folder, or hold control characters."""
+
+def check_name(relative: str, where: Path, *, outside: bool = False) -> None:
+    """Refuses names in the data that are absolute, climb out of their folder, or hold control characters.
+
+    Args:
+        outside: let absolute names and names that climb pass, as --allow-outside does.
+    """
     parts = relative.replace("\\", "/").split("/")
     drive = len(parts[0]) == 2 and parts[0].endswith(":")
-    strange = not relative.isprintable() or not PurePosixPath(relative).name
-    if strange or drive or parts[0] == "" or ".." in parts:
+    if not relative.isprintable() or not PurePosixPath(relative).name:
         raise SceneError(
-            f"the data names a file outside its folder: {relative[:80]!r}",
+            f"the data names a file in a way that no file is named: {_shown(relative)}",
             where=where,
-            todo="name each image in the model by its path below the image folder",
+            cause="a damaged file, or a name that is not UTF-8",
+            todo="rename the file, or correct its name in the data",
+        )
+    if not outside and (drive or parts[0] == "" or ".." in parts):
+        raise SceneError(
+            f"the data names a file outside its folder: {_shown(relative)}",
+            where=where,
+            todo=f"name each image by its path below the scene's folder, or {_OPTION}",
         )
 
 
-def inside(root: Path, relative: str) -> Path:
+def inside(root: Path, relative: str, *, outside: bool = False) -> Path:
     """A path below `root` that really lies there.
+
+    Args:
+        relative: with forward slashes.
+        outside: anywhere will do.
 
     Raises:
         SceneError: the name leads out of the folder by itself or through a symbolic link.
     """
-    check_name(relative, root)
+    check_name(relative, root, outside=outside)
     path = root / relative
+    if outside:
+        return path
     try:
         real, base = path.resolve(), root.resolve()
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         raise SceneError(
             f"the path cannot be followed: {error}", where=path, todo="replace the links by files"
         ) from error
@@ -39,6 +65,54 @@ def inside(root: Path, relative: str) -> Path:
             "a symbolic link leads out of the scene's folder",
             where=f"{path} -> {real}",
             cause="files outside the data folder are never read",
-            todo="copy the file into the folder, or link inside it only",
+            todo=f"copy the file into the folder, or {_OPTION}",
         )
     return path
+
+
+def read_plain(path: Path, most: int = MOST_BYTES) -> bytes:
+    """The bytes of a plain file of at most `most` bytes.
+
+    Raises:
+        OSError: it is missing, may not be read, is not a plain file, or is larger.
+    """
+    # Opening a pipe would wait for its writer.
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    try:
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(0, "it is not a plain file")
+        if status.st_size > most:
+            raise OSError(0, f"it has {status.st_size} bytes; at most {most} are read")
+        with open(handle, "rb", closefd=False) as file:
+            return file.read(status.st_size)
+    finally:
+        os.close(handle)
+
+
+def read_inside(root: Path, relative: str, *, outside: bool = False, most: int = MOST_BYTES) -> bytes:
+    """The bytes of a file below `root`.
+
+    Raises:
+        SceneError: it leads outside, is missing, cannot be read or is too large.
+    """
+    path = inside(root, relative, outside=outside)
+    try:
+        return read_plain(path, most)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise SceneError(
+            f"{PurePosixPath(relative).name} cannot be read: {reason}",
+            where=path,
+            cause="the scene was copied only in part" if isinstance(error, FileNotFoundError) else None,
+            todo="make it a plain file that you may read",
+        ) from error
+
+
+def printable(name: str) -> str:
+    """A file name that can be written anywhere, for messages and records: no broken UTF-8."""
+    return name.encode("utf-8", "replace").decode("utf-8")
+
+
+def _shown(relative: str) -> str:
+    return ascii(relative[:80])[1:-1] if not relative.isprintable() else relative[:80]
