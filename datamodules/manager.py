@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.cameras import Cameras, rays_of
+from visdom_plugin.errors import SceneError
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
 
@@ -24,10 +25,14 @@ class ViewBatch(NamedTuple):
     """(H, W) float32, 1 on the object."""
     mono_depth: Tensor | None
     """(H, W) float32 in its own unit."""
+    weight: Tensor | None = None
+    """(H, W) float32, 0 at pixels that take part in no loss, else 1; None when all of them do."""
+    mask_known: bool = True
+    """False for a view that is good for colour only: its mask says nothing."""
 
 
 class PixelBatch(NamedTuple):
-    """Pixels drawn evenly over all training views."""
+    """Pixels drawn evenly over all training views, ignored ones left out."""
 
     origins: Tensor
     """(n, 3) float32 world frame."""
@@ -37,6 +42,8 @@ class PixelBatch(NamedTuple):
     """(n, 3) float32 in [0, 1]."""
     mask: Tensor
     """(n,) float32, 1 on the object."""
+    mask_known: Tensor | None = None
+    """(n,) bool, False at pixels of views that are good for colour only; None when all masks are known."""
 
 
 class DataManager:
@@ -56,7 +63,11 @@ class DataManager:
         self._images = [image.to(self.device) for image in views.images]
         self._masks = [mask.to(self.device) for mask in views.masks]
         self._depths = [None if d is None else d.to(self.device) for d in views.mono_depths]
-        self._ends = torch.tensor([mask.numel() for mask in views.masks]).cumsum(0)
+        ignored = [views.ignored(i) for i in range(len(views))]
+        self._counted = [None if g is None or not bool(g.any()) else (~g).to(self.device) for g in ignored]
+        self._mask_known = [views.mask_origin(i) not in ("colour", "missing") for i in range(len(views))]
+        self._ends = torch.tensor([mask.numel() for mask in self._masks]).cumsum(0)
+        self._drawable: Tensor | None = None
         self._flat: tuple[Tensor, Tensor] | None = None
 
     def __len__(self) -> int:
@@ -80,15 +91,23 @@ class DataManager:
             self._images[index].float() / 255,
             self._masks[index].float(),
             self._depths[index] if self._depths else None,
+            None if self._counted[index] is None else self._counted[index].float(),
+            self._mask_known[index],
         )
 
     def pixel_batch(self, step: int, n: int) -> PixelBatch:
-        """`n` pixels drawn with replacement, every pixel of every view alike."""
+        """`n` pixels drawn with replacement, every pixel of every view alike but for ignored ones.
+
+        Raises:
+            SceneError: when all pixels are ignored.
+        """
         if self._flat is None:
-            rgb = torch.cat([image.reshape(-1, 3) for image in self._images])
-            self._flat = rgb, torch.cat([mask.reshape(-1) for mask in self._masks])
+            self._flatten()
         draw = generator(self.seed, "pixels", step)
-        flat = torch.randint(int(self._ends[-1]), (n,), generator=draw)
+        if self._drawable is None:
+            flat = torch.randint(int(self._ends[-1]), (n,), generator=draw)
+        else:
+            flat = self._drawable[torch.randint(len(self._drawable), (n,), generator=draw)]
         view = torch.searchsorted(self._ends, flat, right=True)
         inside = (flat - torch.cat([self._ends.new_zeros(1), self._ends])[view]).to(self.device)
         flat, view = flat.to(self.device), view.to(self.device)
@@ -100,4 +119,19 @@ class DataManager:
             rays.directions[:, 0].float(),
             self._flat[0][flat].float() / 255,
             self._flat[1][flat].float(),
+            None if all(self._mask_known) else torch.tensor(self._mask_known, device=self.device)[view],
         )
+
+    def _flatten(self) -> None:
+        rgb = torch.cat([image.reshape(-1, 3) for image in self._images])
+        self._flat = rgb, torch.cat([mask.reshape(-1) for mask in self._masks])
+        if any(c is not None for c in self._counted):
+            pairs = zip(self._counted, self._masks, strict=True)
+            counted = [torch.ones_like(m, dtype=torch.bool) if c is None else c for c, m in pairs]
+            self._drawable = torch.cat([c.reshape(-1) for c in counted]).nonzero()[:, 0].cpu()
+            if len(self._drawable) == 0:
+                raise SceneError(
+                    "every pixel of every training view is ignored",
+                    cause="ignore files that are inverted: white is what must be ignored",
+                    todo="invert them, or take the folder ignore away",
+                )

@@ -8,25 +8,67 @@ from torch import Tensor
 from visdom_plugin.ssim import ssim
 
 
-def photometric_loss(rgb: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+def composite(
+    image: Tensor,
+    mask: Tensor,
+    background: Tensor,
+    *,
+    alpha: Tensor | None = None,
+    mask_known: bool | Tensor | None = None,
+) -> Tensor:
+    """What a render on `background` should look like: the photograph inside the mask, background outside.
+
+    Where the mask is unknown the render's own opacity takes its place, as a constant: the target then asks for
+    the photograph's colour in whatever is there and leaves open whether anything is, so that the photograph's
+    background is painted on nothing and no opacity is called for.
+
+    Args:
+        image: (..., 3) in [0, 1].
+        mask: (...) float, 1 on the object.
+        background: (3,) or (..., 3).
+        alpha: (...) rendered opacity; needed where the mask is unknown.
+        mask_known: (...) bool, or one for all; None means it is known everywhere.
+    """
+    if mask_known is not None and mask_known is not True:
+        known = torch.as_tensor(mask_known, device=mask.device)
+        mask = torch.where(known, mask, alpha.detach())
+    return image * mask[..., None] + background * (1 - mask[..., None])
+
+
+def photometric_loss(rgb: Tensor, target: Tensor, ssim_weight: float, weight: Tensor | None = None) -> Tensor:
     """(1 - w) L1 + w (1 - SSIM), as in 3DGS (Kerbl et al. 2023, eq. 7).
 
     Args:
         rgb, target: (H, W, 3) in [0, 1].
         ssim_weight: w in [0, 1].
+        weight: (H, W) float, 0 at pixels that take no part and 1 elsewhere, or None when all do. Both means
+            are over the pixels that do; to the windows of SSIM the others look as what is outside the image.
     """
-    l1 = (rgb - target).abs().mean()
-    return l1 if ssim_weight == 0 else (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(rgb, target))
+    if weight is None:
+        l1 = (rgb - target).abs().mean()
+        return l1 if ssim_weight == 0 else (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(rgb, target))
+    counted = weight[..., None] > 0
+    rgb, target = torch.where(counted, rgb, 0.0), torch.where(counted, target, 0.0)
+    share = weight.mean().clamp_min(1 / weight.numel())
+    l1 = (rgb - target).abs().mean() / share
+    if ssim_weight == 0:
+        return l1
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(rgb, target)) / share
 
 
-def mask_loss(alpha: Tensor, mask: Tensor) -> Tensor:
+def mask_loss(alpha: Tensor, mask: Tensor, weight: Tensor | None = None) -> Tensor:
     """Mean binary cross entropy between rendered opacity and the foreground mask.
 
     Args:
         alpha: (H, W) in [0, 1].
         mask: (H, W) float, 1 on the object.
+        weight: (H, W) float, 0 at pixels that take no part and 1 elsewhere, or None when all do.
     """
-    return torch.nn.functional.binary_cross_entropy(alpha.clamp(1e-6, 1 - 1e-6), mask)
+    alpha = alpha.clamp(1e-6, 1 - 1e-6)
+    if weight is None:
+        return torch.nn.functional.binary_cross_entropy(alpha, mask)
+    total = torch.nn.functional.binary_cross_entropy(alpha, mask, weight, reduction="sum")
+    return total / weight.sum().clamp_min(1)
 
 
 def disparity_loss(depth: Tensor, alpha: Tensor, mono_depth: Tensor, mask: Tensor) -> Tensor | None:

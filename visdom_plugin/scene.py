@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from torch import Tensor
 
 from visdom_plugin.cameras import Cameras
+
+
+MaskOrigin = Literal["given", "missing", "hull", "colour"]
+"""given: the data has it. missing: it has none, `masks` is True everywhere and says nothing. hull: the outline
+of the other views' hull stands in for it. colour: the same outline says where the view may be trusted for
+colour, and says nothing about what is object within."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +31,37 @@ class Views:
     """N names, unique, as in the data."""
     mono_depths: Sequence[Tensor | None] = ()
     """N tensors (H, W) float32 of monocular depth in its own arbitrary unit, or empty when there is none."""
+    ignore: Sequence[Tensor | None] = ()
+    """N tensors (H, W) bool, True where the photograph tells nothing (an occluder, a lens' dark corner), or None
+    where it tells all; empty when there is none. Unlike a pixel outside the mask, which is known to be empty,
+    such a pixel takes part in no loss and no metric, and cannot carve."""
+    mask_origins: Sequence[MaskOrigin] = ()
+    """Where each mask comes from; empty when all are given."""
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def ignored(self, index: int) -> Tensor | None:
+        """(H, W) bool of one view, or None where nothing is ignored."""
+        return self.ignore[index] if self.ignore else None
+
+    def mask_origin(self, index: int) -> MaskOrigin:
+        """Where one view's mask comes from."""
+        return self.mask_origins[index] if self.mask_origins else "given"
+
+    def silhouettes(self) -> tuple[Cameras, Sequence[Tensor]]:
+        """What may carve: the cameras and masks of the views whose mask was given.
+
+        An ignored pixel may be object for all one knows, so it counts as foreground here.
+        """
+        if not self.mask_origins and not self.ignore:
+            return self.cameras, self.masks
+        given = [i for i in range(len(self)) if self.mask_origin(i) == "given"]
+        ignored = [self.ignored(i) for i in given]
+        masks = [
+            self.masks[i] if g is None else self.masks[i] | g for i, g in zip(given, ignored, strict=True)
+        ]
+        return self.cameras[given], masks
 
 
 @dataclass(frozen=True)
@@ -41,5 +75,29 @@ class Scene:
     """What one unit of the world frame is: "metres", "unknown", ..."""
     source: dict[str, Any] = field(default_factory=dict)
     """Where it came from, for run.json: root, layout, downscale, hashes of the files read."""
+    notes: Sequence[str] = ()
+    """What the reader has to say about how it understood the data, one line each."""
     mesh: tuple[Tensor, Tensor] | None = None
     """Exact surface where it is known: vertices (V, 3) float64 and faces (F, 3) int64, outward."""
+
+
+def describe_masks(views: Views) -> list[str]:
+    """What masks and ignored pixels mean in these views, one line each, for a command's summary.
+
+    Reads no pixels where there is nothing but given masks.
+    """
+    known = {
+        "given": "foreground masks: outside is known to be empty",
+        "missing": "views without a mask",
+        "hull": "views whose mask is the outline of the other views' hull (they do not carve)",
+        "colour": "views without a mask, for colour only inside the other views' hull (no carving, no mask loss)",
+    }
+    origins = [views.mask_origin(i) for i in range(len(views))]
+    lines = [f"{origins.count(kind)} {text}" for kind, text in known.items() if kind in origins]
+    shares = [float(g.double().mean()) for g in views.ignore if g is not None]
+    if shares:
+        lines.append(
+            f"{len(shares)} views with ignored pixels ({sum(shares) / len(shares):.1%} of each on average): "
+            "unknown, so in no loss and no metric, and they do not carve"
+        )
+    return lines

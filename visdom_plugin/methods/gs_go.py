@@ -15,7 +15,7 @@ from torch import Tensor
 
 from visdom_plugin.cameras import Cameras, project
 from visdom_plugin.hooks.protocols import GaussianHook
-from visdom_plugin.losses import disparity_loss, mask_loss, photometric_loss
+from visdom_plugin.losses import composite, disparity_loss, mask_loss, photometric_loss
 from visdom_plugin.methods.configs import GsGoConfig
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
@@ -87,14 +87,21 @@ class GsGo:
         background = background.to(self.device)
         render = self._rasterise(gaussians, batch.camera, background)
         self._render = render
-        target = batch.image * batch.mask[..., None] + background * (1 - batch.mask[..., None])
-        mse = (render.rgb.detach() - target).square().mean()
+        weight = batch.weight
+        target = composite(
+            batch.image, batch.mask, background, alpha=render.alpha, mask_known=batch.mask_known
+        )
+        errors = (render.rgb.detach() - target).square()
+        mse = (
+            errors.mean() if weight is None else (errors.mean(-1) * weight).sum() / weight.sum().clamp_min(1)
+        )
         self.metrics = {"psnr": float(-10 * mse.clamp_min(1e-10).log10())}
-        losses = {"photometric": photometric_loss(render.rgb, target, c.ssim_weight)}
-        if c.mask_weight:
-            losses["mask"] = c.mask_weight * mask_loss(render.alpha, batch.mask)
-        if c.depth_weight and batch.mono_depth is not None:
-            depth = disparity_loss(render.depth, render.alpha, batch.mono_depth, batch.mask)
+        losses = {"photometric": photometric_loss(render.rgb, target, c.ssim_weight, weight)}
+        if c.mask_weight and batch.mask_known:
+            losses["mask"] = c.mask_weight * mask_loss(render.alpha, batch.mask, weight)
+        if c.depth_weight and batch.mono_depth is not None and batch.mask_known:
+            object_mask = batch.mask if weight is None else batch.mask * weight
+            depth = disparity_loss(render.depth, render.alpha, batch.mono_depth, object_mask)
             if depth is not None:
                 losses["depth"] = c.depth_weight * depth
         for i, hook in enumerate(self.hooks):

@@ -46,18 +46,15 @@ def evaluate(
     for i, name in enumerate(views.names):
         rgb, alpha = render_on_white(method, views.cameras[i], device)
         silhouette = None if reference_hull is None else hull_silhouette(reference_hull, views.cameras[i])
+        image, mask, ignore = views.images[i], views.masks[i], views.ignored(i)
         rows[name] = metrics.compare(
-            rgb,
-            alpha,
-            views.images[i],
-            views.masks[i],
-            hull_silhouette=silhouette,
-            perceptual=perceptual,
+            rgb, alpha, image, mask, hull_silhouette=silhouette, perceptual=perceptual, ignore=ignore
         )
         if folder is not None:
             write_png(folder / "test" / f"{files[i]}.png", to_bytes(rgb))
             if i in shown:
-                truth = to_bytes(metrics.whiten(views.images[i], views.masks[i]))
+                truth = metrics.whiten(image, mask)
+                truth = to_bytes(truth if ignore is None else truth.masked_fill(ignore[..., None], 0.5))
                 grey = to_bytes(alpha[..., None].expand(-1, -1, 3))
                 columns.append((f"{name}  {rows[name]['psnr']:.1f} dB", [truth, to_bytes(rgb), grey]))
     if folder is not None and columns:
@@ -80,7 +77,7 @@ def carve_reference(views: Views, domain: Any = None) -> Any | None:
     from visdom_plugin.hull.domain import VisibleDomain
 
     try:
-        return (domain or VisibleDomain()).carve(views.cameras, views.masks)
+        return (domain or VisibleDomain()).carve(*views.silhouettes())
     except EmptyHullError as error:
         log.warning("outside_hull_mass is left out: the reference hull is empty\n  %s", error.what)
         return None

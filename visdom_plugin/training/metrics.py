@@ -84,6 +84,7 @@ def compare(
     *,
     hull_silhouette: Tensor | None = None,
     perceptual: Any = None,
+    ignore: Tensor | None = None,
 ) -> dict[str, float]:
     """All metrics of one view.
 
@@ -94,6 +95,8 @@ def compare(
         mask: (H, W) bool.
         hull_silhouette: (H, W) bool, the reference hull seen by this camera.
         perceptual: the network of `load_lpips`.
+        ignore: (H, W) bool, pixels that count for nothing; None where all count. SSIM and LPIPS see them white
+            in both pictures; SSIM's mean is over the others.
 
     Returns:
         A dict with the keys `NAMES`; NaN where a metric does not apply.
@@ -101,11 +104,23 @@ def compare(
     from visdom_plugin.ssim import ssim
 
     x, y = quantise(rgb), quantise(whiten(image, mask))
+    if ignore is None or not bool(ignore.any()):
+        similarity = float(ssim(x.float(), y.float()))
+        a, b = x, y
+    else:
+        counted = ~ignore
+        if not bool(counted.any()):
+            return dict.fromkeys(NAMES, math.nan)
+        x, y = (torch.where(counted[..., None], z, 1.0) for z in (x, y))
+        similarity = 1 - (1 - float(ssim(x.float(), y.float()))) / float(counted.double().mean())
+        # One row of the pixels that count: the other metrics do not ask how they lie.
+        a, b, mask, alpha = x[counted][None], y[counted][None], mask[counted][None], alpha[counted][None]
+        hull_silhouette = None if hull_silhouette is None else hull_silhouette[counted][None]
     return {
-        "psnr": psnr(x, y),
-        "psnr_per_channel": psnr_per_channel(x, y),
-        "ssim": float(ssim(x.float(), y.float())),
-        "psnr_foreground": psnr_foreground(x, y, mask),
+        "psnr": psnr(a, b),
+        "psnr_per_channel": psnr_per_channel(a, b),
+        "ssim": similarity,
+        "psnr_foreground": psnr_foreground(a, b, mask),
         "silhouette_iou": silhouette_iou(alpha, mask),
         "outside_hull_mass": math.nan
         if hull_silhouette is None

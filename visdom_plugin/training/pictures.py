@@ -33,10 +33,10 @@ def to_bytes(image: Tensor) -> np.ndarray:
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Writes (H, W, 3) uint8 RGB in one step."""
+    """Writes (H, W, 3) RGB or (H, W) grey, uint8, in one step."""
     import cv2
 
-    ok, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+    ok, data = cv2.imencode(".png", image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
     if not ok:
         raise OSError(f"OpenCV could not encode {path}")
     write_bytes(path, data.tobytes())

@@ -48,6 +48,11 @@ def hash_views(views: Views) -> str:
         add(views.images[i], views.masks[i])
         if views.mono_depths and views.mono_depths[i] is not None:
             add(views.mono_depths[i])
+        if views.ignored(i) is not None:
+            digest.update(b"ignore")
+            add(views.ignored(i))
+        if views.mask_origin(i) != "given":
+            digest.update(views.mask_origin(i).encode())
     return digest.hexdigest()
 
 
