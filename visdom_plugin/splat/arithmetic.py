@@ -1,6 +1,6 @@
 """exp that LLVM can vectorise, for the kernels' own use.
 
-After a change to this file, to spherical_harmonics.py or to TILE, delete splat/__pycache__: numba's cache looks
+After a change to this file, to ../harmonics.py or to TILE, delete splat/__pycache__: numba's cache looks
 only at the file a kernel stands in, and would go on using the old code from another one.
 """
 

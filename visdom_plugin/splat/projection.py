@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numba import njit
 
-from visdom_plugin.splat.spherical_harmonics import basis, basis_gradient
+from visdom_plugin.harmonics import basis, basis_gradient
 
 DILATION = 0.3  # px^2, 3DGS's low-pass filter
 ALPHA_MIN = 1 / 255

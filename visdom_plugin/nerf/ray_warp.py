@@ -1,0 +1,62 @@
+"""Distances along a ray, warped so that equal steps are short near the camera and long far from it.
+
+The power ladder of Zip-NeRF (supplement): P(x, p) = |p-1|/p ((x/|p-1| + 1)^p - 1), here for p other than 0 and 1.
+Normalised distances s run from 0 at near to 1 at far.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+POWER = -1.5
+PREMULTIPLIER = 2.0
+CURVE_POWER = -0.25
+CURVE_PREMULTIPLIER = 10_000.0
+
+
+def power_ladder(x: Tensor, power: float, premultiplier: float = 1.0) -> Tensor:
+    """P(premultiplier x, power) of x (...) >= 0; below |power - 1| / |power| for negative powers."""
+    scale = abs(power - 1)
+    return ((x * (premultiplier / scale) + 1) ** power - 1) * (scale / power)
+
+
+def inverse_power_ladder(y: Tensor, power: float, premultiplier: float = 1.0) -> Tensor:
+    """The x (...) >= 0 whose `power_ladder` is y (...)."""
+    scale = abs(power - 1)
+    return ((y * (power / scale) + 1) ** (1 / power) - 1) * (scale / premultiplier)
+
+
+def normalise_distances(
+    t: Tensor, near: Tensor, far: Tensor, power: float = POWER, premultiplier: float = PREMULTIPLIER
+) -> Tensor:
+    """s (..., S) in [0, 1] of distances t (..., S) between near and far (..., 1). power 1 is linear."""
+    rung = _rung(power, premultiplier)
+    low, high = rung(near), rung(far)
+    return ((rung(t) - low) / (high - low)).clamp(0, 1)
+
+
+def distances_of(
+    s: Tensor, near: Tensor, far: Tensor, power: float = POWER, premultiplier: float = PREMULTIPLIER
+) -> Tensor:
+    """t (..., S) of normalised distances s (..., S): the inverse of `normalise_distances`.
+
+    Interpolates (t/|p-1| + 1)^p itself, which keeps its precision where s is near 1 and far is huge.
+    """
+    if power == 1:
+        return near * (1 - s) + far * s
+    rung = _rung(power, premultiplier)
+    between = rung(near) * (1 - s) + rung(far) * s
+    t = (between ** (1 / power) - 1) * (abs(power - 1) / premultiplier)
+    return t.maximum(near).minimum(far)
+
+
+def curve_distances(t: Tensor) -> Tensor:
+    """Distances (...) >= 0 as Zip-NeRF's distortion loss measures them (p = -0.25, times 10,000)."""
+    return power_ladder(t, CURVE_POWER, CURVE_PREMULTIPLIER)
+
+
+def _rung(power: float, premultiplier: float):
+    if power == 1:
+        return lambda t: t
+    factor = premultiplier / abs(power - 1)
+    return lambda t: (t * factor + 1) ** power
