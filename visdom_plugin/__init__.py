@@ -19,6 +19,7 @@ _HOME = {
     "EmptyHullError": "visdom_plugin.errors",
     "VisibleDomain": "visdom_plugin.hull.domain",
     "Hull": "visdom_plugin.hull.hull",
+    "VisDomSampler": "visdom_plugin.hooks.sampler",
     "VisDomGaussianRegularizer": "visdom_plugin.hooks.regularizer",
 }
 

@@ -7,6 +7,40 @@ from typing import Literal
 
 
 @dataclass(frozen=True)
+class SamplerConfig:
+    """VisDomSampler: a band around the hull outside which no samples are taken. One epsilon counts."""
+
+    enabled: bool = False
+    """Whether the hook takes part at all; off leaves the base method unchanged."""
+    epsilon_camera_distances: float | None = 0.2
+    """Half width of the band, in mean distances from the training cameras to the hull's centre (the paper's 0.2
+    for cameras at distance 1)."""
+    epsilon_hull_radii: float | None = None
+    """The same in radii of the hull; wins over camera distances."""
+    epsilon_world: float | None = None
+    """The same in units of the scene; wins over both."""
+    interval: Literal["first_hit", "entry_exit"] = "first_hit"
+    """Around the first hit, as the paper writes, or from before the first to behind the last."""
+    missing: Literal["full", "skip"] = "full"
+    """Rays that miss the hull: sampled over the method's full range, or not at all."""
+    hull_at_inference: bool = False
+    """Novel views, too, are sampled inside the band only, and rays that miss show the background."""
+
+    def build(self, hull, views):
+        """The hook for one hull, and the training views whose mean distance is the unit."""
+        from visdom_plugin.hooks.sampler import VisDomSampler
+
+        epsilon = {"epsilon_world": self.epsilon_world}
+        if self.epsilon_world is None and self.epsilon_hull_radii is not None:
+            epsilon = {"epsilon_hull_radii": self.epsilon_hull_radii}
+        elif self.epsilon_world is None and self.epsilon_camera_distances is not None:
+            distances = ((c - hull.centre) @ (c - hull.centre) for c in views.cameras.centres.numpy())
+            mean = sum(d**0.5 for d in distances) / len(views)
+            epsilon = {"epsilon_world": self.epsilon_camera_distances * mean}
+        return VisDomSampler(hull, **epsilon, interval=self.interval, missing=self.missing)
+
+
+@dataclass(frozen=True)
 class RegularizerConfig:
     """VisDomGaussianRegularizer: hull points to start from, and the loss L_i on views between the cameras."""
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from visdom_plugin.hooks.configs import RegularizerConfig
+from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.nerf.hash_layout import HashLayout
 
 
 @dataclass(frozen=True)
@@ -70,4 +71,62 @@ class GsGoConfig:
     hull: VisibleDomain = field(default_factory=lambda: VisibleDomain(kind="released-go"))
     """Where the Gaussians start."""
     vd: RegularizerConfig = field(default_factory=RegularizerConfig)
+    """The visible-domain hook."""
+
+
+@dataclass(frozen=True)
+class IngpConfig:
+    """Instant-NGP (Müller et al. 2022). Lengths are in mean camera distances unless their name says otherwise.
+
+    The field fills the cube of half side `half_side` around the training cameras' look-at point.
+    """
+
+    steps: int = 20_000
+    """Optimisation steps, one batch of pixels each."""
+    max_rays: int = 8_192
+    """Pixels per step, at most."""
+    samples_per_step: int = 1 << 18
+    """Pixels per step are chosen so that this many samples result (nerfacc, Instant-NGP)."""
+    background: Literal["white", "random"] = "white"
+    """Behind the photograph in training. Random colours need the masks as alpha: a silhouette signal."""
+
+    half_side: float = 1.0
+    near: float = 0.05
+    step_length: float = 0.004
+    """Between two samples of a ray, where the occupancy grid leaves any."""
+    missing_step_length: float = 0.032
+    """The same for rays that miss the hull, with the visible-domain hook: they only clear space."""
+
+    grid: HashLayout = field(
+        default_factory=lambda: HashLayout(16, 2, base_resolution=16, max_resolution=2048, log2_table_size=19)
+    )
+    hidden: int = 64
+    """Width of both networks' hidden layers: one for density, two for colour."""
+    geometry_features: int = 15
+    """Numbers handed from the density network to the colour network."""
+    density_bias: float = -1.0
+    """density = exp(x + bias), per camera distance."""
+
+    occupancy_resolution: int = 128
+    occupancy_every: int = 16
+    """Steps between two updates of the occupancy grid."""
+    occupancy_warm_up: int = 256
+    """Until this step, updates look at all cells; later at a quarter, and at as many occupied ones."""
+    occupancy_fraction: float = 0.25
+    occupancy_alpha: float = 0.01
+    """Cells whose density gives less opacity than this over one step length are skipped."""
+
+    mask_weight: float = 0.0
+    """lambda_1, binary cross entropy between rendered opacity and mask."""
+
+    lr: float = 0.01
+    lr_warm_up: int = 100
+    lr_factor: float = 0.33
+    """The learning rate falls by this factor at 50, 75 and 90 % of the schedule (nerfacc)."""
+    weight_decay: float = 1e-6
+    """Of the networks, not of the hash table."""
+
+    hull: VisibleDomain | None = None
+    """The hull of the visible-domain hook; carved when there is one."""
+    vd: SamplerConfig = field(default_factory=SamplerConfig)
     """The visible-domain hook."""

@@ -19,6 +19,9 @@ class Method(Protocol):
 
     Randomness comes from (seed, step) alone, never from a global generator: a step repeated after a resume
     draws the same numbers.
+
+    A method with a `pixels_per_step(step) -> int` is handed that many pixels of all views per step, any other one
+    a whole view. The number may depend on the method's state, which then is part of `state_dict`.
     """
 
     total_steps: int

@@ -26,7 +26,7 @@ from visdom_plugin.training.trainer import Trainer, view_psnr
 log = logging.getLogger(__name__)
 
 DataManager = Callable[[Views, int, torch.device], Any]
-"""(training views, seed, device) to an object whose `view_batch(step)` is a pure function."""
+"""(training views, seed, device) to an object whose `view_batch(step)` and `pixel_batch(step, n)` are pure."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -107,7 +107,7 @@ def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoi
     batches = data_manager(scene.train, seed, device)
     trainer = Trainer(
         method,
-        batches.view_batch,
+        choose_batches(method, batches),
         run,
         device=device,
         quiet=quiet,
@@ -130,6 +130,14 @@ def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoi
     return trainer.resumed_from
 
 
+def choose_batches(method: Method, batches: Any) -> Callable[[int], Any]:
+    """Whole views, or pixels for a method that says how many of them it wants."""
+    pixels = getattr(method, "pixels_per_step", None)
+    if pixels is None:
+        return batches.view_batch
+    return lambda step: batches.pixel_batch(step, pixels(step))
+
+
 def _warn_of_changes(before: dict[str, Any], now: dict[str, Any]) -> None:
     lines = differences({k: before[k] for k in now if k in before}, {k: now[k] for k in now if k in before})
     if lines:
@@ -146,7 +154,7 @@ def build(
     hull, hull_s = None, 0.0
     if getattr(config, "hull", None) is not None:
         began = time.monotonic()
-        hull = config.hull.carve(views.cameras, views.masks)
+        hull = config.hull.carve(*views.silhouettes())
         hull_s = time.monotonic() - began
     vd = getattr(config, "vd", None)
     hooks = [vd.build(hull, views)] if vd is not None and vd.enabled else []

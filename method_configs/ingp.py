@@ -1,0 +1,50 @@
+"""Instant-NGP and its variants: what each sets, side by side.
+
+`full` is the published size and schedule. `quick` keeps every part and is smaller everywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from visdom_plugin.hooks.configs import SamplerConfig
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.methods.configs import IngpConfig
+from visdom_plugin.nerf.hash_layout import HashLayout
+from visdom_plugin.registry import Preset
+
+FULL = IngpConfig()
+
+QUICK = IngpConfig(
+    steps=800,
+    max_rays=1024,
+    samples_per_step=1 << 14,
+    step_length=0.016,
+    missing_step_length=0.128,
+    grid=HashLayout(8, 2, base_resolution=16, max_resolution=1024, log2_table_size=16),
+    hidden=32,
+    occupancy_resolution=64,
+    occupancy_warm_up=64,
+    occupancy_fraction=0.06,
+    lr_warm_up=50,
+)
+
+MASK = {"mask_weight": 0.1}
+VD = MASK | {"hull": VisibleDomain(dilate_px=1), "vd": SamplerConfig(enabled=True)}
+
+
+def _preset(suffix: str, description: str, changes: dict) -> Preset:
+    return Preset(
+        name=f"ingp{suffix}",
+        description=description,
+        target="visdom_plugin.methods.ingp:Ingp",
+        quick=replace(QUICK, **changes),
+        full=replace(FULL, **changes),
+    )
+
+
+PRESETS = [
+    _preset("", "Instant-NGP on photographs composited on white", {}),
+    _preset("+mask", "Instant-NGP with the paper's silhouette loss, weight 0.1", MASK),
+    _preset("+vd", "Instant-NGP with rays confined to the visible domain, and the silhouette loss", VD),
+]

@@ -1,0 +1,105 @@
+"""The visible domain as bounds of a radiance field's samples (the paper's section 4.2)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.hooks.protocols import RayBounds
+from visdom_plugin.hull.hull import Hull
+from visdom_plugin.hull.raycast import cast
+
+DEFAULT_EPSILON_HULL_RADII = 0.6
+"""About the paper's 0.2 camera distances for an object that fills half the picture; FINDINGS.md has the sweep."""
+
+
+class VisDomSampler:
+    """Confines a ray's samples to a band around the hull.
+
+    Three lines in any trainer of radiance fields:
+
+        sampler = VisDomSampler(hull)
+        near, far, hit = sampler(origins, directions, near, far)
+        # sample between near and far as before
+
+    With t_first and t_last where the ray enters the hull and leaves it for good, the interval is
+
+        first_hit:  [t_first - epsilon, t_first + epsilon]   (the paper's)
+        entry_exit: [t_first - epsilon, t_last + epsilon]
+
+    cut to the caller's [near, far].
+
+    Args:
+        hull: the visible domain; fixed from here on.
+        epsilon_hull_radii: half width of the band in units of `hull.radius`.
+        epsilon_world: the same in scene units; give one of the two.
+        interval: see above.
+        missing: what happens to rays that miss the hull. "full" leaves them the caller's bounds, so that a mask
+            loss clears the space around the object; "skip" gives them an empty interval, near = far.
+
+    Raises:
+        ConfigError: for a setting out of range, or an epsilon in two units.
+    """
+
+    def __init__(
+        self,
+        hull: Hull,
+        *,
+        epsilon_hull_radii: float | None = None,
+        epsilon_world: float | None = None,
+        interval: Literal["first_hit", "entry_exit"] = "first_hit",
+        missing: Literal["full", "skip"] = "full",
+    ):
+        if epsilon_hull_radii is not None and epsilon_world is not None:
+            raise ConfigError(
+                f"epsilon is given twice: {epsilon_hull_radii} hull radii and {epsilon_world} scene units",
+                todo="give one of epsilon_hull_radii and epsilon_world",
+            )
+        if interval not in ("first_hit", "entry_exit") or missing not in ("full", "skip"):
+            raise ConfigError(
+                f"interval={interval!r}, missing={missing!r}: interval must be 'first_hit' or 'entry_exit', "
+                "missing 'full' or 'skip'"
+            )
+        if epsilon_world is None:
+            radii = DEFAULT_EPSILON_HULL_RADII if epsilon_hull_radii is None else epsilon_hull_radii
+            epsilon_world = radii * hull.radius
+        if not 0 <= epsilon_world < float("inf") or (interval == "first_hit" and epsilon_world == 0):
+            raise ConfigError(
+                f"epsilon = {epsilon_world:g} scene units leaves no band to sample",
+                cause="an empty hull, or an epsilon that is negative, zero or not a number",
+                todo="give a positive epsilon_hull_radii or epsilon_world",
+            )
+        self.hull, self.epsilon_world = hull, float(epsilon_world)
+        self.interval, self.missing = interval, missing
+
+    def __call__(self, origins: Tensor, directions: Tensor, near, far) -> RayBounds:
+        """The same as `bound`."""
+        return self.bound(origins, directions, near, far)
+
+    @torch.compiler.disable
+    @torch.no_grad()
+    def bound(self, origins: Tensor, directions: Tensor, near, far) -> RayBounds:
+        """Where along each ray samples may be taken. Pure; no gradient.
+
+        A ray counts as a hit only when its band overlaps the caller's [near, far].
+
+        Args:
+            origins, directions: (..., 3) world frame, broadcast against each other; any length but zero.
+            near, far: (...) tensors or numbers, in units of the direction's length.
+
+        Returns:
+            RayBounds of shape (...), in the directions' dtype, on their device; near <= far everywhere.
+        """
+        crossing = cast(self.hull, origins, directions)
+        first = crossing.t_first
+        near, far = (torch.as_tensor(x).to(first).expand(first.shape) for x in (near, far))
+        last = first if self.interval == "first_hit" else crossing.t_last
+        epsilon = self.epsilon_world / directions.detach().norm(dim=-1).to(first)
+        begin, end = torch.maximum(near, first - epsilon), torch.minimum(far, last + epsilon)
+        hit = crossing.hit & (begin < end)
+        begin = torch.where(hit, begin, near)
+        end = torch.where(hit, end, far if self.missing == "full" else near)
+        return RayBounds(begin, end, hit)

@@ -1,0 +1,159 @@
+"""What all radiance fields share: rays in the field's frame, images from rays, a mesh from density."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visdom_plugin.cameras import Cameras, rays_of
+from visdom_plugin.hooks.protocols import SamplerHook
+from visdom_plugin.nerf.frame import Frame
+from visdom_plugin.render import Render
+
+log = logging.getLogger(__name__)
+
+
+class LocalRays(NamedTuple):
+    """Rays in the field's frame, with the bounds of their samples."""
+
+    origins: Tensor
+    """(n, 3) float32."""
+    directions: Tensor
+    """(n, 3) float32, unit."""
+    near: Tensor
+    """(n,)."""
+    far: Tensor
+    """(n,)."""
+    hit: Tensor
+    """(n,) bool: the visible-domain hook found the hull; True for all without one."""
+
+
+def bound_rays(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    frame: Frame,
+    hooks: Sequence[SamplerHook],
+) -> LocalRays:
+    """Rays in the field's frame, bounded by every hook in turn.
+
+    Args:
+        origins, directions: (n, 3) world frame; directions unit.
+        near, far: (n,) the method's own bounds, in the field's frame.
+        hooks: they see the world frame.
+    """
+    hit = torch.ones_like(near, dtype=torch.bool)
+    for hook in hooks:
+        bounds = hook.bound(origins, directions, near / frame.scale, far / frame.scale)
+        near, far, hit = bounds.near * frame.scale, bounds.far * frame.scale, hit & bounds.hit
+    return LocalRays(frame.to_local(origins), directions.float(), near.float(), far.float(), hit)
+
+
+def render_image(
+    camera: Cameras,
+    render_rays: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]],
+    frame: Frame,
+    chunk: int,
+) -> Render:
+    """One view, without gradients.
+
+    Args:
+        camera: one camera, shape ().
+        render_rays: origins and directions (n, 3), world frame, to colour (n, 3) over the background, opacity
+            (n,), and depth (n,) along the ray in the field's frame.
+        chunk: rays at a time.
+    """
+    rays = rays_of(camera.to(dtype=torch.float64))
+    shape = rays.origins.shape[:2]
+    origins, directions = rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)
+    with torch.no_grad():
+        parts = [
+            render_rays(origins[i : i + chunk], directions[i : i + chunk])
+            for i in range(0, len(origins), chunk)
+        ]
+    rgb, alpha, distance = (torch.cat(x) for x in zip(*parts, strict=True))
+    along = (directions @ camera.forward.to(directions)).float()
+    depth = torch.where(alpha > 0, distance * along / frame.scale, 0)
+    return Render(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape))
+
+
+def mesh_density(
+    density_of: Callable[[Tensor], Tensor],
+    colour_of: Callable[[Tensor, Tensor], Tensor],
+    frame: Frame,
+    half_side: float,
+    *,
+    resolution: int = 160,
+    chunk: int = 1 << 17,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """The surface where a voxel is half opaque, by marching cubes, in the world frame.
+
+    A coarse look at the whole cube finds the box to look at closely.
+
+    Args:
+        density_of: points (m, 3) in the field's frame to density (m,) per unit of that frame.
+        colour_of: points and viewing directions (m, 3) to rgb (m, 3) in [0, 1].
+        half_side: of the cube around the frame's origin.
+        resolution: voxels along the longest side of the box.
+
+    Returns:
+        vertices (V, 3) float64 world frame, faces (F, 3) int64 outward, and rgb (V, 3) uint8 as seen from
+        outside along the normal; None where nothing is opaque.
+    """
+    from skimage.measure import marching_cubes
+
+    def sample(lower: np.ndarray, step: float, shape: Sequence[int]) -> np.ndarray:
+        axes = [torch.from_numpy(lower[a] + step * (np.arange(shape[a]) + 0.5)).float() for a in range(3)]
+        points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        with torch.no_grad():
+            parts = [density_of(points[i : i + chunk]).cpu() for i in range(0, len(points), chunk)]
+        return torch.cat(parts).reshape(*shape).numpy()
+
+    coarse = 64
+    step = 2 * half_side / coarse
+    # exp(-density * step) = 1/2; coarse cells may hold thin parts, so less is asked of them.
+    opaque = np.argwhere(sample(np.full(3, -half_side), step, (coarse,) * 3) > 0.25 * math.log(2) / step)
+    if not len(opaque):
+        return None
+    lower = -half_side + step * (opaque.min(0) - 1)
+    upper = -half_side + step * (opaque.max(0) + 2)
+    step = float((upper - lower).max()) / resolution
+    shape = np.ceil((upper - lower) / step).astype(int)
+    values = np.pad(sample(lower, step, shape), 1)
+    level = math.log(2) / step
+    if not values.max() > level:
+        return None
+    # The logarithm of an exponential field is close to linear between voxels.
+    vertices, faces, normals, _ = marching_cubes(
+        np.log(values + 1e-6), math.log(level), gradient_direction="descent"
+    )
+    local = lower + step * (vertices - 0.5)
+    points = torch.from_numpy(local).float()
+    inward = -torch.nn.functional.normalize(torch.from_numpy(normals.copy()).float(), dim=-1)
+    with torch.no_grad():
+        parts = [
+            colour_of(points[i : i + chunk], inward[i : i + chunk]).cpu()
+            for i in range(0, len(points), chunk)
+        ]
+    rgb = (torch.cat(parts).clamp(0, 1) * 255).round().byte().numpy()
+    return frame.to_world(torch.from_numpy(local)).numpy(), faces.astype(np.int64), rgb
+
+
+def export_mesh(path: Path, mesh: tuple[np.ndarray, np.ndarray, np.ndarray] | None) -> list[Path]:
+    """Writes the mesh as PLY with vertex colours; nothing, with a warning, where there is none."""
+    if mesh is None:
+        log.warning("no mesh is exported: nowhere is the field half opaque")
+        return []
+    import trimesh
+
+    vertices, faces, rgb = mesh
+    trimesh.Trimesh(vertices, faces, vertex_colors=rgb, process=False).export(path)
+    return [path]
