@@ -75,18 +75,34 @@ def decode_mask(data: bytes, path: Path) -> np.ndarray:
 
     An alpha channel that varies is the mask; else the brightest colour channel is.
     """
+    from datamodules import masks
+
+    return masks.decode(data, path).opacity
+
+
+def decode_any(data: bytes, path: Path) -> np.ndarray:
+    """(H, W) or (H, W, C) as stored, uint8 or uint16; colours as BGR or BGRA, palettes and 1 bit spread out.
+
+    EXIF orientation is ignored.
+    """
     import cv2
 
-    image = _decode(data, path, cv2.IMREAD_UNCHANGED)
-    full = np.float32(np.iinfo(image.dtype).max)
-    if image.ndim == 3:
-        channels = image.shape[2]
-        alpha = image[..., -1] if channels in (2, 4) else None
-        if alpha is not None and alpha.min() != alpha.max():
-            image = alpha
-        else:
-            image = image[..., : 3 if channels >= 3 else 1].max(-1)
-    return image.astype(np.float32) / full
+    return _decode(data, path, cv2.IMREAD_UNCHANGED)
+
+
+def has_alpha(data: bytes) -> bool:
+    """Whether a PNG promises transparency; False for everything else."""
+    return data.startswith(_PNG) and len(data) > 25 and (data[25] in (4, 6) or b"tRNS" in data[:2048])
+
+
+def decode_alpha(data: bytes, path: Path) -> np.ndarray | None:
+    """(H, W) float32 in [0, 1], the alpha channel of a photograph; None where it has none or it never varies."""
+    from datamodules import masks
+
+    if not has_alpha(data):
+        return None
+    found = masks.decode_alpha(decode_any(data, path))
+    return None if found is None else found.opacity
 
 
 def decode_depth(data: bytes, path: Path) -> np.ndarray:
@@ -134,7 +150,7 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
 
 def _png_size(data: bytes, path: Path) -> tuple[int, int]:
     """Walks the chunks, checks each one's CRC (PNG specification, section 5) and that IEND is reached."""
-    at, size = len(_PNG), None
+    at, size, packed = len(_PNG), None, 0
     while True:
         if at + 12 > len(data):
             _damaged(path, "the PNG stops before its end")
@@ -148,7 +164,12 @@ def _png_size(data: bytes, path: Path) -> tuple[int, int]:
             if kind != b"IHDR" or length != 13:
                 _damaged(path, "the PNG does not begin with its header")
             size = struct.unpack_from(">II", data, at + 8)
+            bits = data[at + 16] * {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(data[at + 17], 4)
+        packed += length if kind == b"IDAT" else 0
         if kind == b"IEND":
+            # Deflate makes at most 1032 bytes of one: a larger claim is a bomb, or a damaged header.
+            if size[1] * (size[0] * bits // 8) > 1032 * packed:
+                _damaged(path, f"the image claims to be {size[0]} x {size[1]} but holds {packed} bytes")
             return size
         at += 12 + length
 
@@ -167,6 +188,9 @@ def _jpeg_size(data: bytes, path: Path) -> tuple[int, int]:
             height, width = struct.unpack_from(">HH", data, at + 5)
             if data.rfind(b"\xff\xd9") < at:
                 _damaged(path, "the JPEG stops before its end")
+            # A block of 8 x 8 pixels takes at least one bit.
+            if width * height > 512 * len(data):
+                _damaged(path, f"the image claims to be {width} x {height} but holds {len(data)} bytes")
             return width, height
         (length,) = struct.unpack_from(">H", data, at + 2)
         at += 2 + max(length, 2)
