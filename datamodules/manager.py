@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from visdom_plugin.cameras import Cameras, rays_of
+from visdom_plugin.cameras import Cameras, pixel_radius, rays_of
 from visdom_plugin.errors import SceneError
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
@@ -42,6 +42,8 @@ class PixelBatch(NamedTuple):
     """(n, 3) float32 in [0, 1]."""
     mask: Tensor
     """(n,) float32, 1 on the object."""
+    radii: Tensor
+    """(n,) float32 radius of each pixel's cone at distance 1."""
     mask_known: Tensor | None = None
     """(n,) bool, False at pixels of views that are good for colour only; None when all masks are known."""
 
@@ -119,6 +121,7 @@ class DataManager:
             rays.directions[:, 0].float(),
             self._flat[0][flat].float() / 255,
             self._flat[1][flat].float(),
+            pixel_radius(cameras),
             None if all(self._mask_known) else torch.tensor(self._mask_known, device=self.device)[view],
         )
 

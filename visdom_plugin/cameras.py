@@ -230,6 +230,18 @@ def rays_of(cameras: Cameras, uv_px: Tensor | None = None) -> Rays:
     return Rays(origins, directions)
 
 
+def pixel_radius(cameras: Cameras) -> Tensor:
+    """Radius of a pixel's cone at distance 1: the pixel's width times 2 / sqrt(12) (mip-NeRF).
+
+    Args:
+        cameras: (...) cameras.
+
+    Returns:
+        (...) float32.
+    """
+    return (2 / math.sqrt(12) / cameras.intrinsics[..., 0, 0]).float()
+
+
 def look_at_point(cameras: Cameras) -> Tensor:
     """The point closest, in least squares, to all optical axes: what the capture is about.
 

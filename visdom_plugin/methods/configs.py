@@ -130,3 +130,68 @@ class IngpConfig:
     """The hull of the visible-domain hook; carved when there is one."""
     vd: SamplerConfig = field(default_factory=SamplerConfig)
     """The visible-domain hook."""
+
+
+@dataclass(frozen=True)
+class ZipNerfConfig:
+    """Zip-NeRF (Barron et al. 2023) on one device. Lengths are in mean camera distances.
+
+    Defaults are the published ones for a single GPU (camp_zipnerf).
+    """
+
+    steps: int = 200_000
+    """Optimisation steps, one batch of pixels each."""
+    rays: int = 8_192
+    """Pixels per step."""
+    background: Literal["white", "random"] = "white"
+    """Behind the photograph in training. Random colours need the masks as alpha: a silhouette signal."""
+
+    near: float = 0.05
+    far: float = 1e6
+    """Space beyond the cameras is contracted into a ball of radius 2."""
+    samples: tuple[int, int, int] = (64, 64, 32)
+    """Intervals per ray: two proposals, then the field itself."""
+    test_samples: tuple[int, int, int] | None = None
+    """The same when rendering; by default as in training."""
+
+    coarse_grid: HashLayout = field(
+        default_factory=lambda: HashLayout(6, 1, base_resolution=16, max_resolution=512, log2_table_size=21)
+    )
+    """Of the first proposal."""
+    fine_grid: HashLayout = field(
+        default_factory=lambda: HashLayout(8, 1, base_resolution=16, max_resolution=2048, log2_table_size=21)
+    )
+    """Of the second proposal."""
+    grid: HashLayout = field(
+        default_factory=lambda: HashLayout(10, 4, base_resolution=16, max_resolution=8192, log2_table_size=21)
+    )
+    """Of the field."""
+    hidden: int = 64
+    """Width of the density networks' one hidden layer."""
+    bottleneck: int = 256
+    """Numbers handed from the density network to the colour network."""
+    colour_hidden: int = 256
+    colour_layers: int = 3
+    """Hidden layers of the colour network; its input joins again before the last of them."""
+    density_bias: float = -1.0
+    """density = exp(x + bias), per camera distance."""
+
+    mask_weight: float = 0.0
+    """lambda_1, binary cross entropy between rendered opacity and mask."""
+    interlevel_weight: float = 0.01
+    distortion_weight: float = 0.01
+    hash_decay: float = 0.1
+    """Times the mean squares of the tables, summed over levels and grids."""
+    blur: tuple[float, float] = (0.03, 0.003)
+    """Half widths of the interlevel loss, in normalised distance."""
+    anneal_slope: float = 10.0
+
+    lr: float = 0.00125
+    lr_final: float = 0.000125
+    lr_warm_up: int = 20_000
+    lr_delay: float = 1e-8
+
+    hull: VisibleDomain | None = None
+    """The hull of the visible-domain hook; carved when there is one."""
+    vd: SamplerConfig = field(default_factory=SamplerConfig)
+    """The visible-domain hook."""

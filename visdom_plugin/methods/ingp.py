@@ -11,9 +11,16 @@ from torch import Tensor
 
 from visdom_plugin.cameras import Cameras
 from visdom_plugin.hooks.protocols import SamplerHook
-from visdom_plugin.losses import mask_loss
 from visdom_plugin.methods.configs import IngpConfig
-from visdom_plugin.methods.radiance import LocalRays, bound_rays, export_mesh, mesh_density, render_image
+from visdom_plugin.methods.radiance import (
+    LocalRays,
+    bound_rays,
+    export_mesh,
+    mesh_density,
+    photograph_on,
+    render_image,
+    silhouette_loss,
+)
 from visdom_plugin.nerf.directions import encode_harmonics
 from visdom_plugin.nerf.fields import perceptron, truncated_exp
 from visdom_plugin.nerf.frame import frame_of
@@ -80,12 +87,12 @@ class Ingp:
             rays.origins, rays.directions, rays.near, rays.far, step_length, shift, self.occupancy
         )
         rgb, alpha, _ = self._shade(rays, samples, background)
-        target = batch.rgb * batch.mask[:, None] + background * (1 - batch.mask[:, None])
+        target = photograph_on(background, batch, alpha)
         self.metrics = {"psnr": float(-10 * (rgb.detach() - target).square().mean().clamp_min(1e-10).log10())}
         self._adapt(n, len(samples.ray))
         losses = {"colour": torch.nn.functional.huber_loss(rgb, target, delta=HUBER_DELTA) / HUBER_DELTA}
         if c.mask_weight:
-            losses["mask"] = c.mask_weight * mask_loss(alpha, batch.mask)
+            losses["mask"] = c.mask_weight * silhouette_loss(alpha, batch)
         return losses
 
     def optimise(self, step: int) -> None:

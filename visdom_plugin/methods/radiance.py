@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from visdom_plugin.cameras import Cameras, rays_of
 from visdom_plugin.hooks.protocols import SamplerHook
+from visdom_plugin.losses import composite, mask_loss
 from visdom_plugin.nerf.frame import Frame
 from visdom_plugin.render import Render
 
@@ -55,6 +56,16 @@ def bound_rays(
         bounds = hook.bound(origins, directions, near / frame.scale, far / frame.scale)
         near, far, hit = bounds.near * frame.scale, bounds.far * frame.scale, hit & bounds.hit
     return LocalRays(frame.to_local(origins), directions.float(), near.float(), far.float(), hit)
+
+
+def photograph_on(background: Tensor, batch: Any, alpha: Tensor) -> Tensor:
+    """What a batch of pixels should look like on `background` (n, 3); see `losses.composite`."""
+    return composite(batch.rgb, batch.mask, background, alpha=alpha, mask_known=batch.mask_known)
+
+
+def silhouette_loss(alpha: Tensor, batch: Any) -> Tensor:
+    """Binary cross entropy between opacity (n,) and mask, over the pixels whose mask is known."""
+    return mask_loss(alpha, batch.mask, None if batch.mask_known is None else batch.mask_known.float())
 
 
 def render_image(
