@@ -18,7 +18,7 @@ class HashLayout:
 
     Level l has `resolutions[l]` cells along each axis, growing geometrically. A level whose (resolution + 1)^3
     vertices fit into 2^log2_table_size rows is dense, with a row for each vertex, x fastest; a finer one hashes
-    its vertices into 2^log2_table_size rows: (x * 1 xor y * 2654435761 xor z * 805459861) mod the size, in 32 bits.
+    its vertices into 2^log2_table_size rows: (x xor y * 2654435761 xor z * 805459861) mod the size, in 32 bits.
     """
 
     levels: int = 8

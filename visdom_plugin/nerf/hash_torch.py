@@ -12,18 +12,15 @@ from visdom_plugin.nerf.hash_layout import PRIMES, HashLayout
 BITS = 0xFFFFFFFF
 
 
-def encode_torch(points: Tensor, table: Tensor, layout: HashLayout) -> Tensor:
-    """(..., 3) -> (..., levels, features). See `hash_grid.encode`."""
-    points = points.detach().clamp(0, 1)
-    return torch.stack([_level(points, table, layout, level) for level in range(layout.levels)], -2)
-
-
-def encode_mean_torch(points: Tensor, scales: Tensor, table: Tensor, layout: HashLayout):
-    """(..., S, 3), (..., S) -> (..., levels, features), (..., levels). See `hash_grid.encode_mean`."""
+def encode_torch(points: Tensor, scales: Tensor | None, table: Tensor, layout: HashLayout):
+    """(groups, S, 3), (groups, S) or None -> (groups, levels * features), (groups, levels) or None."""
+    points = torch.where(points > 0, points, 0.0).clamp(max=1)  # NaN counts as 0
+    levels = torch.stack([_level(points, table, layout, level) for level in range(layout.levels)], -2)
+    if scales is None:
+        return levels.mean(1).flatten(1), None
     resolutions = torch.tensor(layout.resolutions, dtype=points.dtype, device=points.device)
-    weights = torch.erf(1 / (math.sqrt(8) * scales.detach()[..., None] * resolutions))
-    features = encode_torch(points, table, layout)
-    return (weights[..., None] * features).mean(-3), weights.mean(-2)
+    weights = torch.erf(1 / (math.sqrt(8) * scales[..., None] * resolutions))
+    return (weights[..., None] * levels).mean(1).flatten(1), weights.mean(1)
 
 
 def _level(points: Tensor, table: Tensor, layout: HashLayout, level: int) -> Tensor:

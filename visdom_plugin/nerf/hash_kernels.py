@@ -1,0 +1,239 @@
+"""The hash encoding and its gradient as numba kernels.
+
+Points go through in blocks. For a block and a level, the rows and weights of all eight corners are written to
+two scratch arrays of eight planes, in loops without branches, which vectorise; a second loop then gathers from the
+table, or scatters into its gradient. Corner c has x + 1 where bit 0 of c is set, y + 1 for bit 1, z + 1 for bit 2.
+
+Arrays are flat. Points come in groups of S = `samples` whose features are added up: points (groups * S * 3),
+table (rows * features), encoded (groups * levels * features). `scales` (groups * S) holds the standard deviation
+of each point, or nothing: then points are not weighted.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+FAST = {"reassoc", "contract", "nsz", "arcp"}
+"""As in splat/arithmetic.py; functions with these flags are always inlined, for the reason given there."""
+
+BLOCK = 256
+"""Points per block, at least; a single group may be larger."""
+
+U, W = np.uint64, np.uint32
+# Numba widens every result to 64 bits: indices are unsigned, so that they are not tested for being negative, and
+# hashes are cut back to 32 bits after each operation, so that twice as many fit into a vector.
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+def _erf(x):
+    """erf of x >= 0 within 1e-6 relative, at most 1: x P(x^2) / Q(x^2), fitted for least relative error."""
+    real = np.float32
+    x = min(x, real(4))
+    t = x * x
+    p = real(0.0003361518611200154)
+    p = p * t + real(0.00953626073896885)
+    p = p * t + real(0.07072417438030243)
+    p = p * t + real(0.3359927833080292)
+    p = p * t + real(1.1283787488937378)
+    q = real(1.9290611817268655e-05)
+    q = q * t + real(0.0024049589410424232)
+    q = q * t + real(0.02674618735909462)
+    q = q * t + real(0.17309436202049255)
+    q = q * t + real(0.631088376045227)
+    q = q * t + real(1)
+    return min(x * p / q, real(1))
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+def _weigh(scales, first, count, resolution, strengths):
+    """strengths[p] = erf(1 / (sqrt(8) scale resolution)) of points first .. first + count - 1."""
+    factor = np.float32(1) / (np.float32(math.sqrt(8)) * np.float32(resolution))
+    for p in range(U(count)):
+        strengths[p] = _erf(factor / scales[U(first) + p])
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+def _locate(points, first, count, resolution, dense, mask, offset, strengths, planes, rows, weights):
+    """Rows and weights (8 planes of `planes`) of points first .. first + count - 1. NaN counts as 0."""
+    zero, one = np.float32(0), np.float32(1)
+    r, top, plane = np.float32(resolution), np.int32(resolution - 1), U(planes)
+    if dense:
+        step_y, step_z = W(resolution + 1), W((resolution + 1) * (resolution + 1))
+    else:
+        step_y, step_z = W(2654435761), W(805459861)
+    m, o = W(mask), W(offset)
+    for p in range(U(count)):
+        at = U(3) * (U(first) + p)
+        x, y, z = points[at], points[at + U(1)], points[at + U(2)]
+        x, y, z = (x if x > zero else zero), (y if y > zero else zero), (z if z > zero else zero)
+        x, y, z = min(x, one) * r, min(y, one) * r, min(z, one) * r
+        i, j, k = min(np.int32(x), top), min(np.int32(y), top), min(np.int32(z), top)
+        x1, y1, z1 = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+        x0, y0, z0 = one - x1, one - y1, one - z1
+        s = strengths[p]
+        z0, z1 = s * z0, s * z1
+        w0, w1, w2, w3 = y0 * z0, y1 * z0, y0 * z1, y1 * z1
+        weights[p] = x0 * w0
+        weights[p + plane] = x1 * w0
+        weights[p + U(2) * plane] = x0 * w1
+        weights[p + U(3) * plane] = x1 * w1
+        weights[p + U(4) * plane] = x0 * w2
+        weights[p + U(5) * plane] = x1 * w2
+        weights[p + U(6) * plane] = x0 * w3
+        weights[p + U(7) * plane] = x1 * w3
+        i0, i1 = W(i), W(W(i) + W(1))
+        j0, k0 = W(W(j) * step_y), W(W(k) * step_z)
+        j1, k1 = W(j0 + step_y), W(k0 + step_z)
+        if dense:
+            k0, k1 = W(k0 + o), W(k1 + o)
+            a, b, c, d = W(j0 + k0), W(j1 + k0), W(j0 + k1), W(j1 + k1)
+            rows[p] = W(i0 + a)
+            rows[p + plane] = W(i1 + a)
+            rows[p + U(2) * plane] = W(i0 + b)
+            rows[p + U(3) * plane] = W(i1 + b)
+            rows[p + U(4) * plane] = W(i0 + c)
+            rows[p + U(5) * plane] = W(i1 + c)
+            rows[p + U(6) * plane] = W(i0 + d)
+            rows[p + U(7) * plane] = W(i1 + d)
+        else:
+            a, b, c, d = W(j0 ^ k0), W(j1 ^ k0), W(j0 ^ k1), W(j1 ^ k1)
+            rows[p] = W(W(W(i0 ^ a) & m) + o)
+            rows[p + plane] = W(W(W(i1 ^ a) & m) + o)
+            rows[p + U(2) * plane] = W(W(W(i0 ^ b) & m) + o)
+            rows[p + U(3) * plane] = W(W(W(i1 ^ b) & m) + o)
+            rows[p + U(4) * plane] = W(W(W(i0 ^ c) & m) + o)
+            rows[p + U(5) * plane] = W(W(W(i1 ^ c) & m) + o)
+            rows[p + U(6) * plane] = W(W(W(i0 ^ d) & m) + o)
+            rows[p + U(7) * plane] = W(W(W(i1 ^ d) & m) + o)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+def _locate_level(points, first, count, resolution, dense, mask, offset, strengths, planes, rows, weights):
+    """`_locate` with `dense` a constant in each of two copies."""
+    if dense:
+        _locate(points, first, count, resolution, True, mask, offset, strengths, planes, rows, weights)
+    else:
+        _locate(points, first, count, resolution, False, mask, offset, strengths, planes, rows, weights)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+def _gather(table, features, rows, weights, planes, samples, groups, out, at, stride):
+    """out[at + g stride + f] = sum over the group's points and their corners of weight * table[row, f]."""
+    wide, plane = U(features), U(planes)
+    for g in range(U(groups)):
+        to = U(at) + g * U(stride)
+        for f in range(wide):
+            out[to + f] = np.float32(0)
+        for p in range(g * U(samples), (g + U(1)) * U(samples)):
+            r0, r1 = U(rows[p]) * wide, U(rows[p + plane]) * wide
+            r2, r3 = U(rows[p + U(2) * plane]) * wide, U(rows[p + U(3) * plane]) * wide
+            r4, r5 = U(rows[p + U(4) * plane]) * wide, U(rows[p + U(5) * plane]) * wide
+            r6, r7 = U(rows[p + U(6) * plane]) * wide, U(rows[p + U(7) * plane]) * wide
+            w0, w1, w2, w3 = (
+                weights[p],
+                weights[p + plane],
+                weights[p + U(2) * plane],
+                weights[p + U(3) * plane],
+            )
+            w4, w5 = weights[p + U(4) * plane], weights[p + U(5) * plane]
+            w6, w7 = weights[p + U(6) * plane], weights[p + U(7) * plane]
+            for f in range(wide):
+                low = (w0 * table[r0 + f] + w1 * table[r1 + f]) + (w2 * table[r2 + f] + w3 * table[r3 + f])
+                high = (w4 * table[r4 + f] + w5 * table[r5 + f]) + (w6 * table[r6 + f] + w7 * table[r7 + f])
+                out[to + f] += low + high
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+def _scatter(g_table, features, rows, weights, planes, samples, groups, g_out, at, stride):
+    """The transpose of `_gather`: adds to the table's gradient, in the order of the points."""
+    wide, plane = U(features), U(planes)
+    for g in range(U(groups)):
+        source = U(at) + g * U(stride)
+        for p in range(g * U(samples), (g + U(1)) * U(samples)):
+            for c in range(U(8)):
+                row, weight = U(rows[p + c * plane]) * wide, weights[p + c * plane]
+                for f in range(wide):
+                    g_table[row + f] += weight * g_out[source + f]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def encode(
+    begin, end, groups_per_block, samples, points, scales, table, features,
+    resolutions, dense, masks, offsets, out, mean_strengths,
+):  # fmt: skip
+    """Encodes items begin .. end - 1: item = level * blocks + block, so that neighbours share a level's table.
+
+    Writes out (groups, levels, features) and, if there are scales, mean_strengths (groups, levels).
+    """
+    levels = len(resolutions)
+    groups = len(points) // (3 * samples)
+    blocks = (groups + groups_per_block - 1) // groups_per_block
+    planes = groups_per_block * samples
+    rows, weights = np.empty(8 * planes, np.uint32), np.empty(8 * planes, np.float32)
+    strengths = np.ones(planes, np.float32)
+    share = np.float32(1) / np.float32(samples)
+    stride = levels * features
+    for item in range(begin, end):
+        level, first = item // blocks, (item % blocks) * groups_per_block
+        count = min(groups_per_block, groups - first)
+        if len(scales):
+            _weigh(scales, first * samples, count * samples, resolutions[level], strengths)
+            for g in range(count):
+                total = np.float32(0)
+                for p in range(g * samples, (g + 1) * samples):
+                    strengths[p] *= share
+                    total += strengths[p]
+                mean_strengths[(first + g) * levels + level] = total
+        _locate_level(
+            points, first * samples, count * samples, resolutions[level], dense[level], masks[level],
+            offsets[level], strengths, planes, rows, weights,
+        )  # fmt: skip
+        at = first * stride + level * features
+        if features == 1:
+            _gather(table, 1, rows, weights, planes, samples, count, out, at, stride)
+        elif features == 2:
+            _gather(table, 2, rows, weights, planes, samples, count, out, at, stride)
+        elif features == 4:
+            _gather(table, 4, rows, weights, planes, samples, count, out, at, stride)
+        else:
+            _gather(table, features, rows, weights, planes, samples, count, out, at, stride)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def encode_backward(
+    begin, end, groups_per_block, samples, points, scales, g_out, features,
+    resolutions, dense, masks, offsets, g_table,
+):  # fmt: skip
+    """Writes the table's gradient of `end - begin` levels, the finest first: item 0 is the last level."""
+    levels = len(resolutions)
+    groups = len(points) // (3 * samples)
+    planes = groups_per_block * samples
+    rows, weights = np.empty(8 * planes, np.uint32), np.empty(8 * planes, np.float32)
+    strengths = np.ones(planes, np.float32)
+    share = np.float32(1) / np.float32(samples)
+    stride = levels * features
+    for item in range(begin, end):
+        level = levels - 1 - item
+        g_table[offsets[level] * features : offsets[level + 1] * features] = np.float32(0)
+        for first in range(0, groups, groups_per_block):
+            count = min(groups_per_block, groups - first)
+            if len(scales):
+                _weigh(scales, first * samples, count * samples, resolutions[level], strengths)
+                for p in range(count * samples):
+                    strengths[p] *= share
+            _locate_level(
+                points, first * samples, count * samples, resolutions[level], dense[level], masks[level],
+                offsets[level], strengths, planes, rows, weights,
+            )  # fmt: skip
+            at = first * stride + level * features
+            if features == 1:
+                _scatter(g_table, 1, rows, weights, planes, samples, count, g_out, at, stride)
+            elif features == 2:
+                _scatter(g_table, 2, rows, weights, planes, samples, count, g_out, at, stride)
+            elif features == 4:
+                _scatter(g_table, 4, rows, weights, planes, samples, count, g_out, at, stride)
+            else:
+                _scatter(g_table, features, rows, weights, planes, samples, count, g_out, at, stride)
