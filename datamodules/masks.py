@@ -31,9 +31,10 @@ class Mask(NamedTuple):
 
 
 def fits(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes (width, height) are one picture at two resolutions, each side rounded."""
-    low = max((s - 0.5) / o for s, o in zip(size, other, strict=True))
-    high = min((s + 0.5) / o for s, o in zip(size, other, strict=True))
+    """Whether two sizes (width, height) are one picture at two resolutions, the smaller one's sides rounded."""
+    small, large = sorted((size, other))
+    low = max((s - 0.5) / o for s, o in zip(small, large, strict=True))
+    high = min((s + 0.5) / o for s, o in zip(small, large, strict=True))
     return low <= high and max(size) <= MOST_ENLARGED * max(other)
 
 
