@@ -15,7 +15,7 @@ import numpy as np
 from datamodules import images
 from visdom_plugin.errors import SceneError
 
-MOST_ENLARGED = 8
+MOST_ENLARGED = 10
 """A mask more than this many times wider than its image is refused before it is decoded."""
 _SOFT = (0.02, 0.98)
 _AGREED = 0.01

@@ -2,7 +2,7 @@
 
 import torch
 
-from visdom_plugin.losses import disparity_loss, mask_loss, photometric_loss
+from visdom_plugin.losses import composite, disparity_loss, mask_loss, photometric_loss
 from visdom_plugin.ssim import ssim
 
 
@@ -41,3 +41,53 @@ def test_disparity_loss_needs_ten_pixels():
     mask = torch.zeros(16, 16)
     mask[0, :9] = 1
     assert disparity_loss(ones, ones, ones, mask) is None
+
+
+def test_ignored_pixels_take_no_part():
+    """Neither what is photographed nor what is rendered there changes the loss or the gradient elsewhere."""
+    x, y = images()
+    draw = torch.Generator().manual_seed(3)
+    weight = (torch.rand(24, 20, generator=draw) > 0.3).float()
+    alpha, mask = torch.rand(24, 20, generator=draw), (torch.rand(24, 20, generator=draw) > 0.5).float()
+    hidden = weight[..., None] == 0
+    results = []
+    for other in (0.0, 0.7):
+        rgb = torch.where(hidden, other, x).requires_grad_()
+        opacity = torch.where(weight == 0, other, alpha).requires_grad_()
+        loss = photometric_loss(rgb, torch.where(hidden, 1 - other, y), 0.2, weight)
+        loss = loss + mask_loss(opacity, torch.where(weight == 0, 1.0, mask), weight)
+        loss.backward()
+        assert (rgb.grad[hidden.expand_as(rgb)] == 0).all() and (opacity.grad[weight == 0] == 0).all()
+        assert (rgb.grad != 0).any() and (opacity.grad != 0).any()
+        results.append((loss.detach(), rgb.grad, opacity.grad))
+    assert all(map(torch.equal, *results))
+
+
+def test_weights_of_one_change_nothing_and_means_are_over_what_counts():
+    x, y = images()
+    mask = (y[..., 0] > 0.5).float()
+    ones = torch.ones(24, 20)
+    torch.testing.assert_close(photometric_loss(x, y, 0.2, ones), photometric_loss(x, y, 0.2))
+    torch.testing.assert_close(mask_loss(x[..., 1], mask, ones), mask_loss(x[..., 1], mask))
+    left = torch.zeros(24, 20)
+    left[:, :9] = 1
+    torch.testing.assert_close(photometric_loss(x, y, 0, left), photometric_loss(x[:, :9], y[:, :9], 0))
+    torch.testing.assert_close(mask_loss(x[..., 1], mask, left), mask_loss(x[:, :9, 1], mask[:, :9]))
+    nothing = torch.zeros(24, 20)
+    assert photometric_loss(x, y, 0.2, nothing).abs() < 1e-3 and mask_loss(x[..., 1], mask, nothing) == 0
+
+
+def test_an_unknown_mask_asks_for_colour_and_for_no_opacity():
+    """Where opacity a paints the photograph's colour on the background, the target is met for every a."""
+    image, background = images()[0], torch.tensor([0.2, 0.5, 0.9])
+    mask = torch.ones(24, 20)
+    for a in (0.0, 0.4, 1.0):
+        alpha = torch.full((24, 20), a)
+        render = image * a + background * (1 - a)
+        torch.testing.assert_close(composite(image, mask, background, alpha=alpha, mask_known=False), render)
+    known = torch.rand(24, 20) > 0.5
+    mixed = composite(image, mask, background, alpha=torch.zeros(24, 20), mask_known=known)
+    assert torch.equal(mixed[known], image[known]) and (mixed[~known] == background).all()
+    assert torch.equal(
+        composite(image, mask, background), composite(image, mask, background, mask_known=True)
+    )

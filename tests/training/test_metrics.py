@@ -122,3 +122,40 @@ def test_lpips_without_weights_says_so_and_downloads_nothing(monkeypatch, tmp_pa
     monkeypatch.setitem(sys.modules, "lpips", None)
     caplog.clear()
     assert metrics.load_lpips() is None and not caplog.text
+
+
+def test_ignored_pixels_are_not_measured():
+    draw = torch.Generator().manual_seed(5)
+    rgb, alpha = torch.rand(30, 40, 3, generator=draw), torch.rand(30, 40, generator=draw)
+    image = (torch.rand(30, 40, 3, generator=draw) * 255).to(torch.uint8)
+    mask, seen = torch.rand(30, 40, generator=draw) > 0.4, torch.rand(30, 40, generator=draw) > 0.4
+    ignore = torch.zeros(30, 40, dtype=torch.bool)
+    ignore[:, 25:] = True
+    ignore[10:14, 3:9] = True
+    plain = metrics.compare(rgb, alpha, image, mask, hull_silhouette=seen)
+    none = metrics.compare(rgb, alpha, image, mask, hull_silhouette=seen, ignore=torch.zeros_like(ignore))
+    assert all(plain[n] == none[n] for n in metrics.NAMES if n != "lpips")
+    results = []
+    for value in (0.0, 1.0):
+        results.append(
+            metrics.compare(
+                torch.where(ignore[..., None], value, rgb),
+                torch.where(ignore, value, alpha),
+                torch.where(ignore[..., None], int(255 * (1 - value)), image),
+                torch.where(ignore, value > 0, mask),
+                hull_silhouette=torch.where(ignore, value == 0, seen),
+                ignore=ignore,
+            )
+        )
+    one, other = results
+    assert all(one[n] == other[n] for n in metrics.NAMES if n != "lpips")
+    assert all(one[n] != plain[n] for n in metrics.NAMES if n != "lpips")
+    # A picture that is ignored but for a block is that block.
+    block = ~ignore
+    block[:, 25:], block[10:14] = False, False
+    only = metrics.compare(rgb, alpha, image, mask, ignore=~block)
+    cut = metrics.compare(rgb[:10, :25], alpha[:10, :25], image[:10, :25], mask[:10, :25])
+    rest = metrics.compare(rgb[14:, :25], alpha[14:, :25], image[14:, :25], mask[14:, :25])
+    mean = (10 * 10 ** (-cut["psnr"] / 10) + 16 * 10 ** (-rest["psnr"] / 10)) / 26
+    assert only["psnr"] == pytest.approx(-10 * math.log10(mean))
+    assert all(math.isnan(v) for v in metrics.compare(rgb, alpha, image, mask, ignore=ignore | True).values())

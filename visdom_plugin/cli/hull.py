@@ -47,8 +47,8 @@ class Options:
     """Voxels along the grid's longest side."""
     bounds: Box | None = None
     """Lower and upper corner, six numbers in world units; by default found from cameras and masks."""
-    components: Literal["drop-small", "all", "largest"] = "drop-small"
-    """Which connected pieces stay."""
+    components: Literal["explain", "drop-small", "all", "largest"] = "explain"
+    """Which connected pieces stay: those that explain foreground of their own, large ones, all, the largest."""
     min_component_fraction: float = _DEFAULT.min_component_fraction
     """Pieces below this fraction of the largest are small."""
     dilate_px: int = 0
@@ -57,8 +57,24 @@ class Options:
     """Centre of the ball of --kind unit-sphere, world units."""
     sphere_radius: float | None = None
     """Radius of that ball."""
+    missing_masks: Annotated[Literal["error", "colour", "hull"], tyro.conf.arg(name="data.missing-masks")] = (
+        "error"
+    )
+    """Training views without a mask: an error, or left out of the carving (colour and hull alike)."""
+    mask_source: Annotated[Literal["auto", "folder", "alpha"], tyro.conf.arg(name="data.mask-source")] = (
+        "auto"
+    )
+    """Where masks are read: their folder, the photographs' alpha channel, or whichever there is."""
     out: Path | None = None
     """File to write: .ply for the mesh, .npz for the grid."""
+    masks_out: Path | None = None
+    """Folder to write masks to: the hull's outline seen by each of --cameras, 8-bit PNG, white on the hull."""
+    cameras: Literal["train", "test", "orbit"] = "test"
+    """Cameras of --masks-out: the scene's, or a circle round the hull (with a transforms.json)."""
+    frames: int = 60
+    """Cameras on the circle."""
+    overwrite: bool = False
+    """Let --masks-out replace files."""
     json: bool = False
     """Print one JSON object instead of the table."""
     diagnose: bool = False
@@ -84,36 +100,66 @@ def _main(argv: Sequence[str]) -> None:
         )
     names = [f.name for f in fields(VisibleDomain)]
     domain = VisibleDomain(**{name: getattr(options, name) for name in names})
-    import datamodules
+    if options.frames < 1:
+        raise ConfigError(f"--frames is {options.frames}; it must be at least 1")
+    from visdom_plugin.cli.scenes import open_scene
 
-    scene = datamodules.load(
-        options.folder or options.data, views=options.views, downscale=options.downscale, seed=options.seed
+    scene = open_scene(
+        options.folder or options.data,
+        views=options.views,
+        downscale=options.downscale,
+        seed=options.seed,
+        missing_masks=options.missing_masks,
+        mask_source=options.mask_source,
+        fill=False,
     )
-    report = report_hull(domain, scene, out=options.out, diagnosing=options.diagnose)
+    masks = None
+    if options.masks_out is not None:
+        masks = MaskRequest(options.masks_out, options.cameras, options.frames, options.overwrite)
+    report = report_hull(domain, scene, out=options.out, diagnosing=options.diagnose, masks=masks)
     if options.json:
         sys.stdout.write(json.dumps(report) + "\n")
     elif not options.quiet:
         sys.stdout.write(_table(report))
 
 
+@dataclass(frozen=True)
+class MaskRequest:
+    """Masks to make of a hull."""
+
+    folder: Path
+    cameras: str
+    frames: int
+    overwrite: bool
+
+
 def report_hull(
-    domain: VisibleDomain, scene, *, out: Path | None = None, diagnosing: bool = False
+    domain: VisibleDomain,
+    scene,
+    *,
+    out: Path | None = None,
+    diagnosing: bool = False,
+    masks: MaskRequest | None = None,
 ) -> dict[str, Any]:
-    """Carves, measures and writes one hull.
+    """Carves, measures and writes one hull and its masks.
 
     Returns:
         Plain numbers and lists, ready for JSON.
     """
     from visdom_plugin.hull.diagnose import border_share, diagnose, measure_coverage
     from visdom_plugin.hull.mesh import is_closed
+    from visdom_plugin.scene import describe_masks
 
     views = scene.train
-    hull = domain.carve(views.cameras, views.masks)
-    coverage = measure_coverage(hull, views.cameras, views.masks)
+    cameras, silhouettes = views.silhouettes()
+    names = [n for i, n in enumerate(views.names) if views.mask_origin(i) == "given"]
+    hull = domain.carve(cameras, silhouettes)
+    coverage = measure_coverage(hull, cameras, silhouettes)
     summary = hull.summary
     report = {
         "scene": scene.name,
-        "views": list(views.names),
+        "views": names,
+        "masks": [*describe_masks(views), *scene.notes],
         "kind": domain.kind,
         "k": summary["k"],
         "voxels": hull.voxels,
@@ -127,26 +173,32 @@ def report_hull(
         "seconds": summary["seconds"],
         "bounds_seconds": summary["bounds_seconds"],
         "bounds_closed": summary["bounds_closed"],
-        "coverage": {n: round(c.covered, 6) for n, c in zip(views.names, coverage, strict=True)},
-        "inside_mask": {n: round(c.inside, 6) for n, c in zip(views.names, coverage, strict=True)},
-        "touches_border": [
-            n for n, m in zip(views.names, views.masks, strict=True) if border_share(m.numpy()) > 0
-        ],
+        "coverage": {n: round(c.covered, 6) for n, c in zip(names, coverage, strict=True)},
+        "inside_mask": {n: round(c.inside, 6) for n, c in zip(names, coverage, strict=True)},
+        "touches_border": [n for n, m in zip(names, silhouettes, strict=True) if border_share(m.numpy()) > 0],
         "components": summary["components"],
         "components_found": summary["components_found"],
+        "components_dropped": summary["components_dropped"],
         "watertight": is_closed(hull.to_mesh()[1]),
         "agreement_means": summary["agreement_means"],
     }
     if diagnosing:
-        found = diagnose(domain, hull, views.cameras, views.masks, views.names)
+        found = diagnose(domain, hull, cameras, silhouettes, names)
         report["diagnosis"] = {
             "findings": found.findings,
-            "removes": {n: round(v.removes, 4) for n, v in zip(views.names, found.views, strict=True)},
+            "removes": {n: round(v.removes, 4) for n, v in zip(names, found.views, strict=True)},
             "voxels_per_k": found.voxels_per_k,
         }
     if out is not None:
         hull.write_ply(out) if out.suffix == ".ply" else hull.save(out)
         report["out"] = str(out)
+    if masks is not None:
+        from visdom_plugin.cli.hull_masks import choose_cameras, write_masks
+
+        seen_by, files = choose_cameras(masks.cameras, scene, hull, masks.frames)
+        orbit = masks.cameras == "orbit"
+        write_masks(hull, seen_by, files, masks.folder, poses=orbit, overwrite=masks.overwrite)
+        report["masks_out"] = {"folder": str(masks.folder), "cameras": masks.cameras, "count": len(files)}
     return report
 
 
@@ -155,12 +207,17 @@ def _table(report: dict[str, Any]) -> str:
     rows = [
         ("scene", f"{report['scene']}, {len(report['views'])} views"),
         ("rule", f"{report['kind']}, K = {report['k']}; {report['agreement_means']}"),
+        *(("data", text) for text in report["masks"]),
         (
             "voxels",
             f"{report['voxels']} of {' x '.join(map(str, report['shape']))}, edge {report['voxel_size']:.4g}",
         ),
         ("size", f"{size}, volume {report['volume']:.5g}, surface {report['surface_area']:.5g}"),
-        ("pieces", f"{report['components']} of {report['components_found']} kept"),
+        (
+            "pieces",
+            f"{report['components']} of {report['components_found']} kept"
+            + (f"; {report['components_dropped']}" if report["components_dropped"] else ""),
+        ),
         ("mesh", "watertight" if report["watertight"] else "not watertight"),
         ("seconds", f"{report['seconds']:.2f}, and {report['bounds_seconds']:.2f} to find the bounds"),
     ]
@@ -182,5 +239,8 @@ def _table(report: dict[str, Any]) -> str:
         rows += [("found", text) for text in report["diagnosis"]["findings"] or ["nothing wrong"]]
     if "out" in report:
         rows.append(("written", report["out"]))
+    if "masks_out" in report:
+        made = report["masks_out"]
+        rows.append(("masks", f"{made['count']} of the {made['cameras']} cameras in {made['folder']}"))
     width = max(len(name) for name, _ in rows)
     return "".join(f"{name:<{width}}  {text}\n" for name, text in rows)

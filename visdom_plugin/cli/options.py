@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
 from dataclasses import field as dataclass_field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from visdom_plugin import registry
 from visdom_plugin.errors import ConfigError
@@ -28,6 +30,15 @@ class Common:
     """Training views."""
     downscale: float = 1.0
     """Work on images smaller by this factor."""
+    missing_masks: Annotated[Literal["error", "colour", "hull"], tyro.conf.arg(name="data.missing-masks")] = (
+        "error"
+    )
+    """Views without a mask: an error; for colour only, inside the hull of the other views; or that hull's outline
+    becomes their mask."""
+    mask_source: Annotated[Literal["auto", "folder", "alpha"], tyro.conf.arg(name="data.mask-source")] = (
+        "auto"
+    )
+    """Where masks are read: their folder, the photographs' alpha channel, or whichever there is."""
     seed: int = 0
     """Start of all random numbers."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -48,7 +59,7 @@ class Common:
     """Print nothing but errors."""
 
 
-SAVED = ("data", "views", "downscale", "seed", "device", "budget")
+SAVED = ("data", "views", "downscale", "missing_masks", "mask_source", "seed", "device", "budget")
 """Common options that a config file holds beside `method` and `settings`."""
 
 
@@ -72,8 +83,6 @@ def parse(argv: Sequence[str], prog: str = "visdom-train") -> Request:
         ConfigError: for an unknown or missing method, and for everything wrong in the file.
         SystemExit: by tyro, for --help (0) and for unknown options or values (2).
     """
-    import tyro
-
     words, rest = [a for a in argv if a.startswith(WORD)], [a for a in argv if not a.startswith(WORD)]
     if len(words) > 1:
         raise ConfigError(f"one method at a time, please: {' '.join(words)}")
@@ -126,8 +135,6 @@ def dump(request: Request) -> str:
 
 
 def _without_method(rest: Sequence[str], prog: str) -> None:
-    import tyro
-
     known = registry.installed()
     if any(a in ("-h", "--help") for a in rest):
         lines = [f"{WORD}{p.name}: {p.description}." for p in known.presets.values()]

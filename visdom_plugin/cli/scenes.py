@@ -16,6 +16,39 @@ def make_data_manager(views, seed: int, device) -> Any:
     return DataManager(views, seed, device=device)
 
 
+def open_scene(
+    path: Path | None,
+    *,
+    views: int,
+    downscale: float,
+    seed: int,
+    missing_masks: str = "error",
+    mask_source: str = "auto",
+    fill: bool = True,
+    **reading: Any,
+) -> Scene:
+    """A scene as a command asks for it.
+
+    Args:
+        missing_masks: what becomes of views without a mask, see `training.missing_masks`.
+        mask_source: "folder", "alpha" or "auto".
+        fill: False leaves views without a mask as they are, for who only carves.
+        reading: other options of `datamodules.load`.
+
+    Raises:
+        SceneError: for every fault of the data.
+    """
+    from datamodules import load
+    from visdom_plugin.training.missing_masks import fill_masks
+
+    if mask_source != "auto":
+        reading["mask_source"] = mask_source
+    if missing_masks != "error":
+        reading["allow_missing_masks"] = True
+    scene = load(path, views=views, downscale=downscale, seed=seed, **reading)
+    return fill_masks(scene, missing_masks) if fill else scene
+
+
 def load_again(record: dict[str, Any], run: Path, data: Path | None) -> Scene:
     """The scene a run was trained on.
 
@@ -27,7 +60,6 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None) -> Scene:
         CheckpointError: when what is found there is not what the run was trained on.
         SceneError: when it cannot be read.
     """
-    from datamodules import load
     from visdom_plugin.training.rundir import hash_views
 
     noted = record["data"]
@@ -36,7 +68,14 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None) -> Scene:
         raise CheckpointError(
             f"the run's scene is not at {path} any more", where=run, todo="say where it is with --data DIR"
         )
-    scene = load(path, views=noted["views"], downscale=noted["downscale"], seed=noted["seed"])
+    scene = open_scene(
+        path,
+        views=noted["views"],
+        downscale=noted["downscale"],
+        seed=noted["seed"],
+        missing_masks=noted.get("missing_masks", "error"),
+        mask_source=noted.get("mask_source", "auto"),
+    )
     if hash_views(scene.train) != noted["hashes"]["train_views"]:
         raise CheckpointError(
             f"the scene at {path or '(built-in)'} is not the one this run was trained on",

@@ -9,6 +9,9 @@ from pathlib import Path
 
 from visdom_plugin.cli import errors, options
 
+READING = ("views", "downscale", "seed", "missing_masks", "mask_source")
+"""Common options that say how the scene is read, kept in run.json to read it again."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit status."""
@@ -23,18 +26,21 @@ def _train(argv: Sequence[str]) -> None:
         return
     device = options.resolve_device(common.device)
 
-    from datamodules import load
     from visdom_plugin.cli.report import say, show_result
-    from visdom_plugin.cli.scenes import make_data_manager
+    from visdom_plugin.cli.scenes import make_data_manager, open_scene
+    from visdom_plugin.scene import describe_masks
     from visdom_plugin.training.run import train
 
-    scene = load(common.data, views=common.views, downscale=common.downscale, seed=common.seed)
+    asked = {name: getattr(common, name) for name in READING}
+    scene = open_scene(common.data, **asked)
     folder = common.out or default_run_dir(scene.name, len(scene.train), request.preset.name, common.seed)
     if not common.quiet:
         data = "the built-in scene" if common.data is None else common.data
         say(
             f"{request.preset.name} on {data} ({scene.name}): {len(scene.train)} training views, {request.note}"
         )
+        for line in (*describe_masks(scene.train), *scene.notes):
+            say(f"data: {line}")
         say(f"run directory: {folder}")
     record = train(
         request.preset.name,
@@ -50,9 +56,7 @@ def _train(argv: Sequence[str]) -> None:
         budget=common.budget,
         request={
             "path": None if common.data is None else str(common.data.expanduser().resolve()),
-            "views": common.views,
-            "downscale": common.downscale,
-            "seed": common.seed,
+            **asked,
         },
     )
     if not common.quiet:

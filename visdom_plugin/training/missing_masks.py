@@ -1,0 +1,114 @@
+"""Views without a mask: the hull of the views that have one stands in.
+
+The outline of that hull, seen by the view, holds the object wherever the other masks are right, and usually some
+of the background beside it. As "hull" it is the view's mask. As "colour" it only says where the view is looked
+at: outside nothing is asked, inside the photograph's colours are asked of whatever the model has there (see
+`losses.composite`), and the mask loss is left out. In neither case does the view carve: its outline comes from
+the others and would count their votes twice.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from visdom_plugin.errors import SceneError
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.scene import Scene, Views
+
+log = logging.getLogger(__name__)
+
+Way = Literal["error", "colour", "hull"]
+
+
+def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> Scene:
+    """A scene in which every view has a mask of some kind.
+
+    Test views without one are measured against the hull's outline whatever the way, and say so.
+
+    Args:
+        scene: whose views without a mask have the mask origin "missing".
+        way: what becomes of them.
+        domain: how the hull is carved; by default the default visible domain, with K at most the number of
+            training views that have a mask.
+
+    Returns:
+        The same scene when no mask is missing.
+
+    Raises:
+        SceneError: masks are missing and `way` is "error", or fewer than two training views have one.
+        EmptyHullError: the masks that are there leave no hull.
+    """
+    missing = {name: [i for i in range(len(v)) if v.mask_origin(i) == "missing"] for name, v in _parts(scene)}
+    if not any(missing.values()):
+        return scene
+    absent = [views.names[i] for name, views in _parts(scene) for i in missing[name]]
+    given = len(scene.train) - len(missing["train"])
+    if way == "error" or given < 2:
+        raise SceneError(
+            f"{len(absent)} views have no mask: {', '.join(absent[:5])}{', ...' if len(absent) > 5 else ''}",
+            where=scene.name,
+            cause=f"and only {given} training views have one: a hull needs two" if way != "error" else None,
+            todo="make masks for them"
+            if way != "error"
+            else "make masks for them, or pass --data.missing-masks colour|hull",
+        )
+    domain = VisibleDomain(k=min(3, given)) if domain is None else domain
+    hull = domain.carve(*scene.train.silhouettes())
+    outlines = {name: outline_views(hull, views, missing[name]) for name, views in _parts(scene)}
+    for name, views in _parts(scene):
+        for i, outline in outlines[name].items():
+            if not bool(outline.any()):
+                log.warning("%s has no mask and does not see the hull of the other views", views.names[i])
+    return replace(
+        scene,
+        train=_filled(scene.train, outlines["train"], way),
+        test=_filled(scene.test, outlines["test"], "hull"),
+    )
+
+
+def outline_views(hull, views: Views, indices: Sequence[int]) -> dict[int, Tensor]:
+    """(H, W) bool by index: where the pixels' rays meet the hull."""
+    from visdom_plugin.hull.raycast import depth_and_silhouette
+
+    return {i: depth_and_silhouette(hull, views.cameras[i].to("cpu"))[1] for i in indices}
+
+
+def _parts(scene: Scene) -> tuple[tuple[str, Views], tuple[str, Views]]:
+    return ("train", scene.train), ("test", scene.test)
+
+
+def _filled(views: Views, outlines: dict[int, Tensor], way: Way) -> Views:
+    if not outlines:
+        return views
+    origins = tuple(way if i in outlines else views.mask_origin(i) for i in range(len(views)))
+    filled = replace(views, masks=_Replaced(views.masks, outlines), mask_origins=origins)
+    if way != "colour":
+        return filled
+    beside = {i: _either(~outline, views.ignored(i)) for i, outline in outlines.items()}
+    return replace(filled, ignore=_Replaced(views.ignore or (None,) * len(views), beside))
+
+
+def _either(one: Tensor, other: Tensor | None) -> Tensor:
+    return one if other is None else one | torch.as_tensor(other)
+
+
+class _Replaced(Sequence):
+    """A sequence with some items replaced, the others not looked at before they are asked for."""
+
+    def __init__(self, base: Sequence, changed: Mapping[int, Tensor]):
+        self._base, self._changed = base, changed
+
+    def __len__(self) -> int:
+        return len(self._base)
+
+    def __getitem__(self, index):
+        if isinstance(index, slice):
+            return tuple(self[i] for i in range(*index.indices(len(self))))
+        index = range(len(self))[index]
+        return self._changed[index] if index in self._changed else self._base[index]
