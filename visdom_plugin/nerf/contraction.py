@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+import torch
+from numba import njit
 from torch import Tensor
+
+from visdom_plugin.threads import spread
+
+POINTS_PER_PIECE = 16384
 
 
 def contract(points: Tensor, std: Tensor | None = None):
@@ -18,6 +25,15 @@ def contract(points: Tensor, std: Tensor | None = None):
     Returns:
         (..., 3) points of norm < 2, and with `std` also the new (...) standard deviations.
     """
+    constant = not (
+        torch.is_grad_enabled() and (points.requires_grad or (std is not None and std.requires_grad))
+    )
+    if std is not None and constant and points.device.type == "cpu" and points.dtype == torch.float32:
+        return _contract_cpu(points, std)
+    return _contract_torch(points, std)
+
+
+def _contract_torch(points: Tensor, std: Tensor | None):
     r = points.norm(dim=-1).clamp_min(1)
     across = (2 - 1 / r) / r
     contracted = points * across[..., None]
@@ -30,3 +46,32 @@ def uncontract(points: Tensor) -> Tensor:
     """The inverse of `contract`: (..., 3) points of norm < 2 to (..., 3) points of any norm."""
     norm = points.norm(dim=-1, keepdim=True).clamp_min(1)
     return points / (norm * (2 - norm))
+
+
+def _contract_cpu(points: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
+    flat = points.detach().reshape(-1, 3).contiguous().numpy()
+    deviations = std.detach().float().expand(points.shape[:-1]).reshape(-1).contiguous().numpy()
+    out, scaled = np.empty_like(flat), np.empty_like(deviations)
+    spread(_contract, len(flat), POINTS_PER_PIECE, flat, deviations, out, scaled)
+    return torch.from_numpy(out).reshape(points.shape), torch.from_numpy(scaled).reshape(points.shape[:-1])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _contract(begin, end, points, std, out, scaled):
+    one, two, third = np.float32(1), np.float32(2), np.int32(3)
+    for i in range(begin, end):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        square = x * x + y * y + z * z
+        if square <= one:
+            out[i, 0], out[i, 1], out[i, 2], scaled[i] = x, y, z, std[i]
+            continue
+        q = one / np.sqrt(square)
+        across = q * (two - q)
+        out[i, 0], out[i, 1], out[i, 2] = x * across, y * across, z * across
+        # The cube root of v: a third of the exponent, then Halley's step twice, 2e-7 relative at the end.
+        v = q * across
+        root = np.int32(np.float32(v).view(np.int32) // third + np.int32(0x2A514067)).view(np.float32)
+        for _ in range(2):
+            cube = root * root * root
+            root *= (cube + v + v) / (cube + cube + v)
+        scaled[i] = std[i] * root * root

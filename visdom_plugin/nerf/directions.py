@@ -27,9 +27,14 @@ def encode_harmonics(directions: Tensor) -> Tensor:
         out = np.empty((len(flat), 16), flat.contiguous().numpy().dtype)
         spread(_harmonics, len(flat), DIRECTIONS_PER_PIECE, flat.contiguous().numpy(), out)
         return torch.from_numpy(out).reshape(*directions.shape[:-1], 16)
-    out = flat.new_empty(16, len(flat))
-    basis.py_func(3, *flat.unbind(-1), out)  # the same lines, each on all directions at once
-    return out.T.reshape(*directions.shape[:-1], 16)
+    return _harmonics_torch(flat).reshape(*directions.shape[:-1], 16)
+
+
+def _harmonics_torch(directions: Tensor) -> Tensor:
+    """The kernel's own lines, each on all directions (N, 3) at once."""
+    out = directions.new_empty(16, len(directions))
+    basis.py_func(3, *directions.unbind(-1), out)
+    return out.T
 
 
 def encode_sinusoids(directions: Tensor, degree: int = 4) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from visdom_plugin.nerf import step_kernels
 from visdom_plugin.nerf.step_functions import resample_blurred
 
 
@@ -27,6 +28,12 @@ def antialiased_interlevel_loss(
         (...) sums over the proposal's intervals. The published factor of 0.01 multiplies their mean: divide
         by P.
     """
+    if w_prop.device.type == "cpu":
+        return _Interlevel.apply(w_prop, t_nerf.detach(), w_nerf.detach(), t_prop.detach(), half_width, eps)
+    return _antialiased_torch(t_nerf, w_nerf, t_prop, w_prop, half_width, eps)
+
+
+def _antialiased_torch(t_nerf, w_nerf, t_prop, w_prop, half_width, eps):
     target = resample_blurred(t_nerf, w_nerf, half_width, t_prop).to(w_prop)
     return ((target - w_prop).clamp_min(0).square() / (w_prop + eps)).sum(-1)
 
@@ -59,6 +66,23 @@ def distortion_loss(t: Tensor, w: Tensor) -> Tensor:
         (...) sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (t_{i+1} - t_i), m the intervals' middles.
     """
     return _Distortion.apply(t.detach(), w)
+
+
+class _Interlevel(torch.autograd.Function):
+    """The kernel finds the slopes along with the loss."""
+
+    @staticmethod
+    def forward(ctx, w_prop, t_nerf, w_nerf, t_prop, half_width, eps):
+        arrays = (t_nerf, w_nerf, t_prop, w_prop)
+        out = step_kernels.run(step_kernels.interlevel, w_prop.shape[-1] + 1, arrays, half_width, eps)
+        ctx.save_for_backward(out[..., :-1])
+        return out[..., -1].clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, g):
+        (slopes,) = ctx.saved_tensors
+        return g[..., None] * slopes, None, None, None, None, None
 
 
 class _Distortion(torch.autograd.Function):

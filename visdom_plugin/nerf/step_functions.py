@@ -9,7 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-LEAST_WEIGHT = 1e-12  # so that a ray that meets nothing is sampled evenly over its intervals
+from visdom_plugin.nerf import step_kernels
+from visdom_plugin.nerf.step_kernels import LEAST_WEIGHT
 
 
 @torch.no_grad()
@@ -32,11 +33,19 @@ def sample_edges(edges: Tensor, weights: Tensor, count: int, jitter: Tensor | No
     """
     if count < 2:
         raise ValueError(f"sample_edges makes at least 2 intervals, not {count}")
+    if jitter is None:
+        jitter = edges.new_full((1,), 0.5)
+    if edges.device.type == "cpu":
+        return step_kernels.run(step_kernels.sample, count + 1, (edges, weights, jitter))
+    return _sample_torch(edges, weights, count, jitter)
+
+
+def _sample_torch(edges: Tensor, weights: Tensor, count: int, jitter: Tensor) -> Tensor:
+    edges = edges.expand(*weights.shape[:-1], -1)
     mass = weights.clamp_min(LEAST_WEIGHT).cumsum(-1)
     mass = torch.nn.functional.pad(mass / mass[..., -1:], (1, 0))
     steps = torch.arange(count, dtype=mass.dtype, device=mass.device)
-    u = (steps + (0.5 if jitter is None else jitter)) / count
-    u = u.expand(*mass.shape[:-1], count).contiguous()
+    u = ((steps + jitter) / count).expand(*mass.shape[:-1], count).contiguous()
     points = _interpolate(mass, edges, u)
     middles = 0.5 * (points[..., 1:] + points[..., :-1])
     first = (2 * points[..., :1] - middles[..., :1]).maximum(edges[..., :1])
@@ -81,14 +90,23 @@ def dilate(edges: Tensor, weights: Tensor, distance: float, low: float = 0.0, hi
     Returns:
         edges (..., 3 S + 1) and weights (..., 3 S).
     """
+    wide = torch.cat([edges, edges[..., :-1] - distance, edges[..., 1:] + distance], -1)
+    wide = wide.sort(-1).values.clamp(low, high)
+    if edges.device.type == "cpu":
+        arrays = (edges, weights, wide)
+        return wide, step_kernels.run(step_kernels.dilate, wide.shape[-1] - 1, arrays, distance)
+    return wide, _dilate_torch(edges, weights, distance, wide)
+
+
+def _dilate_torch(edges: Tensor, weights: Tensor, distance: float, wide: Tensor) -> Tensor:
     tiny = torch.finfo(edges.dtype).tiny
-    density = weights / edges.diff(dim=-1).clamp_min(tiny)
+    width = edges.diff(dim=-1)
+    density = torch.where(width > 0, weights / width.clamp_min(tiny), 0)
     lower, upper = edges[..., :-1] - distance, edges[..., 1:] + distance
-    wide = torch.cat([edges, lower, upper], -1).sort(-1).values.clamp(low, high)
     middles = 0.5 * (wide[..., 1:] + wide[..., :-1])[..., None]
     covered = (lower[..., None, :] <= middles) & (middles < upper[..., None, :])
     new = torch.where(covered, density[..., None, :], 0).amax(-1) * wide.diff(dim=-1)
-    return wide, new * (weights.sum(-1, keepdim=True) / new.sum(-1, keepdim=True).clamp_min(tiny))
+    return new * (weights.sum(-1, keepdim=True) / new.sum(-1, keepdim=True).clamp_min(tiny))
 
 
 @torch.no_grad()
@@ -119,8 +137,15 @@ def resample_blurred(edges: Tensor, weights: Tensor, half_width: float, at: Tens
         at: (..., N + 1) ascending points.
 
     Returns:
-        (..., N) float64.
+        (..., N).
     """
+    if edges.device.type == "cpu":
+        arrays = (edges, weights, at)
+        return step_kernels.run(step_kernels.resample_blurred, at.shape[-1] - 1, arrays, half_width)
+    return _resample_blurred_torch(edges, weights, half_width, at).to(weights)
+
+
+def _resample_blurred_torch(edges: Tensor, weights: Tensor, half_width: float, at: Tensor) -> Tensor:
     edges, weights, at = edges.double(), weights.double(), at.double()
     width = edges.diff(dim=-1)
     mass = torch.nn.functional.pad(weights.cumsum(-1), (1, 0))

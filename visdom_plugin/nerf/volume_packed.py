@@ -56,24 +56,16 @@ def _composite_torch(density, rgb, starts, ends, ray_offsets, background):
         return running[last] - running[first]
 
     depth = ((ends - starts) * density).double().clamp_max(OPAQUE)
-    running = depth.cumsum(0) - depth
+    running = torch.cat([depth.new_zeros(1), depth.cumsum(0)])
     ray = torch.repeat_interleave(
         torch.arange(len(first), device=first.device), last - first, output_size=len(density)
     )
-    weights = torch.exp(running[first.clamp_max(max(len(density) - 1, 0))][ray] - running) * -torch.expm1(
-        -depth
-    )
-    values = torch.cat(
-        [rgb.double(), torch.ones_like(depth)[:, None], (0.5 * (starts + ends)).double()[:, None]], 1
-    )
-    sums = sum_per_ray(weights[:, None] * values)
+    weights = torch.exp(running[first][ray] - running[:-1]) * -torch.expm1(-depth)
+    middles = (0.5 * (starts + ends)).double()[:, None]
+    sums = sum_per_ray(weights[:, None] * torch.cat([rgb.double(), torch.ones_like(middles), middles], 1))
     alpha = sums[:, 3]
     colour = sums[:, :3] + (1 - alpha)[:, None] * background
-    far = (
-        torch.where(last > first, ends[(last - 1).clamp_min(0)], 0.0)
-        if len(ends)
-        else torch.zeros_like(alpha)
-    )
+    far = torch.where(last > first, torch.cat([ends.new_zeros(1), ends])[last], 0)
     distance = (sums[:, 4] + EMPTY * far) / (alpha + EMPTY)
     return colour.to(rgb), alpha.to(rgb), distance.to(rgb), weights.detach().to(density)
 
