@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, text and binary: cameras and registered images (3D points are not read).
+"""COLMAP's sparse models, text and binary: cameras, registered images and, for those who ask, 3D points.
 
 Formats after COLMAP's documentation (doc/format.rst): little-endian, poses world to camera as Hamilton
 quaternions (w, x, y, z) and translations, pixel centres at +0.5. Declared counts are compared with the bytes
@@ -12,11 +12,14 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
+import numpy as np
 import torch
 
 from datamodules.images import MAX_PIXELS
+from datamodules.paths import inside, read_inside
+from datamodules.undistort import COEFFICIENTS, Distortion
 from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import SceneError
 from visdom_plugin.rotations import matrix_from_quaternion
@@ -30,7 +33,8 @@ MODELS = {
     16: ("EUCM", 6), 17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
 FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
-_DISTORTED = {name for name, _ in MODELS.values()} - {"SIMPLE_PINHOLE", "PINHOLE"}
+_ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}
+"""Of the models that can be undistorted, those whose parameters begin f, cx, cy and not fx, fy, cx, cy."""
 _UNDISTORT = "undistort: colmap image_undistorter --image_path images --input_path sparse/0 --output_path DIR"
 
 
@@ -66,39 +70,71 @@ class Model:
     images: tuple[Registered, ...]
 
 
-def read_model(folder: Path) -> Model:
+class Points(NamedTuple):
+    """Triangulated points."""
+
+    xyz: np.ndarray
+    """(P, 3) float64 world frame."""
+    rgb: np.ndarray
+    """(P, 3) uint8."""
+    error: np.ndarray
+    """(P,) float64 mean reprojection error in pixels."""
+
+
+def find_model(root: Path) -> str | None:
+    """The folder below `root`, "" for itself, that holds a model's cameras and images files."""
+    for folder in ("sparse/0", "sparse", "colmap/sparse/0", "colmap_sparse/0", "dense/sparse", ""):
+        start = f"{folder}/" if folder else ""
+        if any((root / f"{start}{name}").exists() for name in FILES):
+            return folder
+    return None
+
+
+def read_model(root: Path, folder: str, *, outside: bool = False) -> Model:
     """Reads `cameras` and `images` of a model folder, the binary pair where there is one, else the text pair.
+
+    Args:
+        root: the scene's folder.
+        folder: of the model, below it; "" for the root itself.
+        outside: files may lie outside of the root.
 
     Raises:
         SceneError: no complete pair, or a file that is truncated, damaged or contradicts itself.
     """
     for suffix, read_cameras, read_images in (
-        (".bin", _cameras_binary, _images_binary),
-        (".txt", _cameras_text, _images_text),
+        (".bin", parse_cameras_binary, parse_images_binary),
+        (".txt", parse_cameras_text, parse_images_text),
     ):
-        cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
-        if cameras.is_file() and images.is_file():
-            try:
-                return Model(folder, read_cameras(cameras), tuple(read_images(images)))
-            except OSError as error:
-                raise SceneError(
-                    f"the COLMAP model cannot be read: {error.strerror}", where=folder
-                ) from error
+        names = [f"{folder}/{name}{suffix}".lstrip("/") for name in ("cameras", "images")]
+        paths = [inside(root, name, outside=outside) for name in names]
+        if all(path.is_file() for path in paths):
+            cameras, images = (read_inside(root, name, outside=outside) for name in names)
+            return Model(root / folder, read_cameras(cameras, paths[0]), tuple(read_images(images, paths[1])))
     raise SceneError(
         "no COLMAP model: neither cameras.bin with images.bin nor cameras.txt with images.txt",
-        where=folder,
+        where=root / folder,
         todo="put the model's files there; colmap model_converter turns one form into the other",
     )
 
 
-def cameras_of(model: Model, images: Sequence[Registered]) -> Cameras:
-    """Float64 cameras of some registered images, at the full resolution of the model.
+def read_points(root: Path, folder: str, *, outside: bool = False) -> Points | None:
+    """The model's points3D, binary before text; None where there is no such file."""
+    for suffix, parse in ((".bin", parse_points_binary), (".txt", parse_points_text)):
+        name = f"{folder}/points3D{suffix}".lstrip("/")
+        path = inside(root, name, outside=outside)
+        if path.is_file():
+            return parse(read_inside(root, name, outside=outside), path)
+    return None
+
+
+def cameras_of(model: Model, images: Sequence[Registered]) -> tuple[Cameras, list[Distortion | None]]:
+    """Float64 cameras of some registered images, at the full resolution of the model, and their distortions.
 
     Raises:
-        SceneError: for a lens model with distortion, impossible sizes or intrinsics, NaN or infinite poses,
-            a zero quaternion, or a camera id that the model does not have; named by image.
+        SceneError: for a lens model that cannot be undistorted, impossible sizes or intrinsics, NaN or
+            infinite poses, a zero quaternion, or a camera id that the model does not have; named by image.
     """
-    K, rotations, translations = [], [], []
+    K, rotations, translations, distortions = [], [], [], []
     for image in images:
         lens = model.cameras.get(image.camera_id)
         if lens is None:
@@ -108,7 +144,9 @@ def cameras_of(model: Model, images: Sequence[Registered]) -> Cameras:
                 cause="the cameras and images files come from different models, or one is damaged",
                 todo="export both from the same reconstruction",
             )
-        K.append(_pinhole(lens, image.name, model.folder))
+        matrix, distortion = _lens(lens, image.name, model.folder)
+        K.append(matrix)
+        distortions.append(distortion)
         _check_pose(image, model.folder)
         rotations.append(image.quaternion)
         translations.append(image.translation)
@@ -118,35 +156,33 @@ def cameras_of(model: Model, images: Sequence[Registered]) -> Cameras:
     rotation = matrix_from_quaternion(quaternion).mT
     centre = -(rotation @ torch.tensor(translations, dtype=torch.float64).reshape(-1, 3, 1))
     lenses = [model.cameras[image.camera_id] for image in images]
-    return Cameras.from_matrices(
+    cameras = Cameras.from_matrices(
         torch.tensor(K, dtype=torch.float64).reshape(-1, 3, 3),
         torch.cat([rotation, centre], -1),
         width=torch.tensor([lens.width for lens in lenses], dtype=torch.int64),
         height=torch.tensor([lens.height for lens in lenses], dtype=torch.int64),
     )
+    return cameras, distortions
 
 
-def _pinhole(lens: Intrinsics, name: str, folder: Path) -> list[list[float]]:
-    if lens.model in _DISTORTED:
+def _lens(lens: Intrinsics, name: str, folder: Path) -> tuple[list[list[float]], Distortion | None]:
+    if lens.model not in COEFFICIENTS:
+        known = lens.model in dict(MODELS.values())
         raise SceneError(
-            f"image {name} has the lens model {lens.model}; only PINHOLE and SIMPLE_PINHOLE can be used",
+            f"image {name} has the {'' if known else 'unknown '}lens model {lens.model[:40]}; possible are "
+            + ", ".join(COEFFICIENTS),
             where=folder,
-            cause="the photographs still have their lens distortion",
+            cause="the photographs still have their lens distortion" if known else None,
             todo=_UNDISTORT,
         )
-    if lens.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
-        raise SceneError(
-            f"image {name} has the unknown lens model {lens.model}; known are PINHOLE and SIMPLE_PINHOLE",
-            where=folder,
-            todo=_UNDISTORT,
-        )
-    if lens.model == "SIMPLE_PINHOLE":
-        fx, cx, cy = lens.params
+    if lens.model in _ONE_FOCAL:
+        fx, cx, cy, *rest = lens.params
         fy = fx
     else:
-        fx, fy, cx, cy = lens.params
+        fx, fy, cx, cy, *rest = lens.params
     size_ok = lens.width > 0 and lens.height > 0 and lens.width * lens.height <= MAX_PIXELS
-    if not size_ok or not all(map(math.isfinite, lens.params)) or min(fx, fy) <= 0:
+    finite = all(map(math.isfinite, lens.params)) and max(map(abs, lens.params)) < 1e9
+    if not size_ok or not finite or min(fx, fy) < 1e-6:
         raise SceneError(
             f"the camera of image {name} is impossible: {lens.width} x {lens.height} pixels, focal lengths "
             f"{fx:g} and {fy:g}, principal point ({cx:g}, {cy:g})",
@@ -154,7 +190,8 @@ def _pinhole(lens: Intrinsics, name: str, folder: Path) -> list[list[float]]:
             cause="a damaged file, or a calibration that failed",
             todo="export the model again",
         )
-    return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    distortion = Distortion(lens.model, tuple(rest))
+    return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], None if distortion.absent else distortion
 
 
 def _check_pose(image: Registered, folder: Path) -> None:
@@ -183,8 +220,8 @@ def _damaged(path: Path, what: str, cause: str = "the file is truncated or damag
 class _Bytes:
     """A reader that never goes past the end of its file."""
 
-    def __init__(self, path: Path):
-        self.path, self.data, self.at = path, path.read_bytes(), 0
+    def __init__(self, data: bytes, path: Path):
+        self.path, self.data, self.at = path, data, 0
 
     def take(self, form: str) -> tuple:
         self.need(struct.calcsize(form))
@@ -223,8 +260,8 @@ class _Bytes:
             )
 
 
-def _cameras_binary(path: Path) -> dict[int, Intrinsics]:
-    file, cameras = _Bytes(path), {}
+def parse_cameras_binary(data: bytes, path: Path) -> dict[int, Intrinsics]:
+    file, cameras = _Bytes(data, path), {}
     for _ in range(file.count(24 + 16)):
         camera_id, model_id, width, height = file.take("<IiQQ")
         if model_id not in MODELS:
@@ -239,8 +276,8 @@ def _cameras_binary(path: Path) -> dict[int, Intrinsics]:
     return cameras
 
 
-def _images_binary(path: Path) -> list[Registered]:
-    file, images = _Bytes(path), {}
+def parse_images_binary(data: bytes, path: Path) -> list[Registered]:
+    file, images = _Bytes(data, path), {}
     for _ in range(file.count(4 + 56 + 4 + 1 + 8)):
         image_id, *pose, camera_id = file.take("<I7dI")
         name = file.string()
@@ -250,23 +287,53 @@ def _images_binary(path: Path) -> list[Registered]:
     return list(images.values())
 
 
+def parse_points_binary(data: bytes, path: Path) -> Points:
+    """Of points3D.bin, by gathering fixed fields at the offsets that the track lengths give."""
+    file = _Bytes(data, path)
+    count, at, end = file.count(8 + 24 + 3 + 8 + 8), 8, len(data)
+    starts, length = np.empty(count, np.int64), struct.Struct("<Q").unpack_from
+    for i in range(count):
+        if at + 51 > end:
+            file.at = at
+            file.need(51)
+        starts[i] = at
+        at += 51 + 8 * length(data, at + 43)[0]
+    file.at = min(at, end)
+    file.need(at - file.at)
+    file.finish()
+    raw = (
+        np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(8, 43)]
+        if count
+        else np.zeros((0, 35), np.uint8)
+    )
+    return _points(
+        raw[:, :24].copy().view("<f8"), raw[:, 24:27].copy(), raw[:, 27:].copy().view("<f8")[:, 0], path
+    )
+
+
+def _points(xyz: np.ndarray, rgb: np.ndarray, error: np.ndarray, path: Path) -> Points:
+    if not np.isfinite(xyz).all():
+        _damaged(path, f"{path.name} holds points at NaN or infinite places")
+    return Points(xyz, rgb, error)
+
+
 def _add(table: dict, key: int, value, path: Path) -> None:
     if key in table:
         _damaged(path, f"{path.name} lists the id {key} twice", cause="a damaged or badly merged file")
     table[key] = value
 
 
-def _lines(path: Path) -> list[str]:
+def _lines(data: bytes, path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
+        return data.decode("utf-8").splitlines()
     except UnicodeDecodeError:
         _damaged(path, f"{path.name} is not text in UTF-8", cause="a binary or damaged file named .txt")
 
 
-def _cameras_text(path: Path) -> dict[int, Intrinsics]:
+def parse_cameras_text(data: bytes, path: Path) -> dict[int, Intrinsics]:
     cameras: dict[int, Intrinsics] = {}
     known = dict(MODELS.values())
-    for number, line in enumerate(_lines(path), 1):
+    for number, line in enumerate(_lines(data, path), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         fields = line.split()
@@ -281,10 +348,10 @@ def _cameras_text(path: Path) -> dict[int, Intrinsics]:
     return cameras
 
 
-def _images_text(path: Path) -> list[Registered]:
+def parse_images_text(data: bytes, path: Path) -> list[Registered]:
     images: dict[int, Registered] = {}
     # Every image has two lines, and the second (its 2D points) may be empty: blank lines count.
-    lines = [(n, line) for n, line in enumerate(_lines(path), 1) if not line.lstrip().startswith("#")]
+    lines = [(n, line) for n, line in enumerate(_lines(data, path), 1) if not line.lstrip().startswith("#")]
     at = 0
     while at < len(lines):
         number, line = lines[at]
@@ -312,3 +379,22 @@ def _images_text(path: Path) -> list[Registered]:
                 )
         _add(images, image_id, Registered(name, pose[:4], pose[4:], camera_id), path)
     return list(images.values())
+
+
+def parse_points_text(data: bytes, path: Path) -> Points:
+    """Of points3D.txt; tracks are not read."""
+    rows = []
+    for number, line in enumerate(_lines(data, path), 1):
+        fields = line.split(maxsplit=8)
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            row = list(map(float, fields[1:8]))
+            fine = len(row) == 7 and all(0 <= c <= 255 for c in row[3:6])
+        except ValueError:
+            fine = False
+        if not fine:
+            _damaged(path, f"line {number} is not `ID X Y Z R G B ERROR TRACK...`: {line.strip()[:80]!r}")
+        rows.append(row)
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    return _points(table[:, :3], table[:, 3:6].astype(np.uint8), table[:, 6], path)

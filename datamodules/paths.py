@@ -109,6 +109,11 @@ def read_inside(root: Path, relative: str, *, outside: bool = False, most: int =
         ) from error
 
 
+def stem(name: str) -> str:
+    """A view's name without its extension, by which views are sorted and their masks found."""
+    return str(PurePosixPath(name).with_suffix(""))
+
+
 def printable(name: str) -> str:
     """A file name that can be written anywhere, for messages and records: no broken UTF-8."""
     return name.encode("utf-8", "replace").decode("utf-8")

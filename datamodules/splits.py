@@ -1,107 +1,257 @@
-"""Index files: which registered images train and which test."""
+"""Which views train and which test: lists given by hand, index files, the layout's own, or evenly spread.
+
+Positions are zero-based in the list of all views of the scene, in the layout's order (sorted by name).
+"""
 
 from __future__ import annotations
 
 import hashlib
-from pathlib import Path
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
 
-from datamodules.paths import inside
-from visdom_plugin.errors import SceneError
+from datamodules.paths import read_inside, read_plain
+from datamodules.request import Request
+from visdom_plugin.errors import ConfigError, SceneError
+
+log = logging.getLogger(__name__)
+
+DEFAULT_VIEWS = 4
 
 
-def read_splits(
-    root: Path, views: int | None, registered: int, *, test: bool = True
-) -> tuple[list[int], list[int], dict[str, str]]:
-    """Positions of the training and test views in the name-sorted list of registered images.
+@dataclass(frozen=True)
+class Split:
+    """Positions of the views of one request."""
+
+    train: list[int]
+    test: list[int]
+    hashes: dict[str, str]
+    """SHA-256 of each index file read, by its name."""
+    rule: str
+    """How the views were chosen, for people."""
+
+
+@dataclass(frozen=True)
+class Pools:
+    """What a layout says of its own split."""
+
+    train: tuple[int, ...]
+    """Positions that training views may be taken from."""
+    test: tuple[int, ...]
+    rule: str
+    """Where this split is from."""
+
+
+def every_eighth(count: int) -> Pools:
+    """The standard split of MipNeRF360: positions 0, 8, 16, ... test, the others train."""
+    test = tuple(range(0, count, 8)) if count > 1 else ()
+    return Pools(tuple(i for i in range(count) if i not in test), test, "every 8th view is for testing")
+
+
+def spread(pool: Sequence[int], count: int) -> list[int]:
+    """`count` members of `pool`, the first and the last among them, at even steps (halves rounded up)."""
+    if count == 1:
+        return [pool[0]]
+    last, steps = len(pool) - 1, count - 1
+    return [pool[(2 * i * last + steps) // (2 * steps)] for i in range(count)]
+
+
+def choose(
+    root: Path, names: Sequence[str], request: Request, pools: Pools, *, indexed: bool = False
+) -> Split:
+    """The views of a request.
 
     Args:
-        root: the scene's folder, with sparse_<N>.txt and sparse_test.txt.
-        views: N, or None for the smallest there is.
-        registered: number of registered images.
-        test: False ignores sparse_test.txt.
-
-    Returns:
-        train positions and test positions in the files' order, and the SHA-256 of each file read by its name.
+        root: the scene's folder, where index files may lie.
+        names: of all views, in the layout's order.
+        pools: the layout's own split, for what nobody lists.
+        indexed: the layout demands index files.
 
     Raises:
-        SceneError: a file is missing, is not integers, is out of range, repeats itself, has another length
-            than its name says, or shares a view with the other.
+        SceneError: an index file is missing, is not integers, is out of range, repeats itself, has another
+            length than its name says, or shares a view with the other; too few views.
+        ConfigError: the same of a list given by hand.
     """
-    available = sorted(
-        int(path.stem.removeprefix("sparse_"))
-        for path in root.glob("sparse_*.txt")
-        if path.stem.removeprefix("sparse_").isdecimal()
+    count, hashes, rules = len(names), {}, []
+    train = tested = None
+    train_where, test_where = "--train-list", "--test-list"
+    if request.train_list is not None:
+        train = _by_hand(request.train_list, names, train_where)
+        rules.append("training views as listed by hand")
+        if request.views not in (None, len(train)):
+            log.info("%s lists %d views; --views %d is ignored", train_where, len(train), request.views)
+    if not request.test:
+        tested = []
+    elif request.test_list is not None:
+        tested = _by_hand(request.test_list, names, test_where)
+    files = _index_files(root)
+    if train is None and (indexed or files):
+        views = min(files, default=None) if request.views is None else request.views
+        if views in files:
+            train_where = f"sparse_{views}.txt"
+            train, hashes[train_where] = _read(root, train_where, count, request.allow_outside)
+            _check_length(root, train_where, train, views)
+            rules.append(f"training views of {train_where}")
+        elif indexed:
+            _no_index_file(root, views, sorted(files))
+    if tested is None and ((root / "sparse_test.txt").is_file() or indexed):
+        test_where = "sparse_test.txt"
+        if not (root / test_where).is_file():
+            raise SceneError(
+                "sparse_test.txt is missing",
+                where=root,
+                todo="write the zero-based positions of the views to test on into it, one per line",
+            )
+        tested, hashes[test_where] = _read(root, test_where, count, request.allow_outside)
+    if tested is None:
+        taken = set(train or ())
+        tested = [i for i in pools.test if i not in taken]
+        rules.append(pools.rule)
+    if train is None:
+        # Test views by the layout's rule stay out of training even when nobody asks for them.
+        free = set(pools.test) if not request.test and request.test_list is None else set(tested)
+        train, rule = _spread(root, names, [i for i in pools.train if i not in free], request.views)
+        rules.append(rule)
+    _refuse_shared(train, tested, f"{train_where} and {test_where}", root)
+    return Split(train, tested, hashes, "; ".join(rules))
+
+
+def _spread(root: Path, names: Sequence[str], pool: list[int], views: int | None) -> tuple[list[int], str]:
+    wanted = min(DEFAULT_VIEWS, len(pool)) if views is None else views
+    if not pool or not 1 <= wanted <= len(pool):
+        raise SceneError(
+            f"{wanted} training views are wanted, but {len(pool)} of the {len(names)} views are for training",
+            where=root,
+            todo=f"pass --views with 1 to {len(pool)}, or choose by hand with --train-list and --test-list"
+            if pool
+            else "choose by hand with --train-list and --test-list",
+        )
+    train = spread(pool, wanted)
+    shown = ", ".join(names[i] for i in train[:12]) + (", ..." if len(train) > 12 else "")
+    log.info(
+        "%s: no index file for %d views; they are spread evenly over the %d that are not for testing: %s",
+        root,
+        wanted,
+        len(pool),
+        shown,
     )
-    if views is None and available:
-        views = available[0]
-    if views not in available:
-        listed = ", ".join(map(str, available))
-        raise SceneError(
-            f"there is no sparse_{'<N>' if views is None else views}.txt"
-            + (f"; this scene has index files for {listed} views" if available else ""),
-            where=root,
-            todo=f"pass --views with one of {listed}"
-            if available
-            else "write the zero-based positions of the training views, one per line, into sparse_<N>.txt",
-        )
-    train_path, test_path = root / f"sparse_{views}.txt", root / "sparse_test.txt"
-    train, train_hash = _read(train_path, registered)
-    if len(train) != views:
-        raise SceneError(
-            f"{train_path.name} lists {len(train)} views, its name says {views}",
-            where=train_path,
-            todo="rename the file or correct the list",
-        )
-    if not test:
-        return train, [], {train_path.name: train_hash}
-    if not test_path.is_file():
-        raise SceneError(
-            "sparse_test.txt is missing",
-            where=root,
-            todo="write the zero-based positions of the views to test on into it, one per line",
-        )
-    tested, test_hash = _read(test_path, registered)
+    return train, f"training views spread evenly over {len(pool)}"
+
+
+def _refuse_shared(train: list[int], tested: list[int], where: str, root: Path) -> None:
     shared = sorted(set(train) & set(tested))
     if shared:
         raise SceneError(
             f"training and test share views {', '.join(map(str, shared[:8]))}",
-            where=f"{train_path} and {test_path.name}",
+            where=f"{root}: {where}",
             cause="a test on views that were trained on measures nothing",
-            todo=f"take them out of {test_path.name}",
+            todo=f"take them out of {where.split(' and ')[1]}",
         )
-    return train, tested, {train_path.name: train_hash, test_path.name: test_hash}
 
 
-def _read(path: Path, registered: int) -> tuple[list[int], str]:
-    try:
-        data = inside(path.parent, path.name).read_bytes()
-    except OSError as error:
+def _index_files(root: Path) -> set[int]:
+    stems = (path.stem.removeprefix("sparse_") for path in root.glob("sparse_*.txt"))
+    return {int(stem) for stem in stems if stem.isascii() and stem.isdecimal() and len(stem) < 7}
+
+
+def _no_index_file(root: Path, views: int | None, available: list[int]) -> None:
+    listed = ", ".join(map(str, available))
+    raise SceneError(
+        f"there is no sparse_{'<N>' if views is None else views}.txt"
+        + (f"; this scene has index files for {listed} views" if available else ""),
+        where=root,
+        todo=f"pass --views with one of {listed}"
+        if available
+        else "write the zero-based positions of the training views, one per line, into sparse_<N>.txt",
+    )
+
+
+def _check_length(root: Path, name: str, train: list[int], views: int) -> None:
+    if len(train) != views:
         raise SceneError(
-            f"the index file cannot be read: {error.strerror}", where=path, todo="make it a plain text file"
-        ) from error
+            f"{name} lists {len(train)} views, its name says {views}",
+            where=root / name,
+            todo="rename the file or correct the list",
+        )
+
+
+def _by_hand(text: str, names: Sequence[str], where: str) -> list[int]:
+    """Positions of a comma list of positions and names, or of an index file anywhere on the disk."""
+    path = Path(text).expanduser() if text.startswith("~") else Path(text)
+    try:
+        is_file = path.is_file()
+    except (OSError, ValueError):
+        is_file = False
+    if is_file:
+        try:
+            words = read_plain(path, 2**24).decode("utf-8", errors="replace").replace(",", " ").split()
+        except OSError as error:
+            raise ConfigError(
+                f"the list cannot be read: {error.strerror}", where=f"{where} {text}"
+            ) from error
+    else:
+        words = [word.strip() for word in text.split(",") if word.strip()]
+    by_name = {PurePosixPath(name).with_suffix("").as_posix(): i for i, name in enumerate(names)}
+    by_name |= {name: i for i, name in enumerate(names)}
+    positions = []
+    for word in words:
+        if word in by_name:
+            positions.append(by_name[word])
+        elif _is_integer(word) and 0 <= int(word) < len(names):
+            positions.append(int(word))
+        else:
+            raise ConfigError(
+                f"{where} names {word[:60]!r}, which is no view of this scene",
+                where=f"{where} {text[:200]}",
+                cause=None if is_file or "," in text else "there is no such file either",
+                todo=f"list positions from 0 to {len(names) - 1} or names such as {names[0]}, with commas between",
+            )
+    if not positions or len(set(positions)) < len(positions):
+        raise ConfigError(
+            f"{where} lists {'a view twice' if positions else 'no views'}", where=f"{where} {text[:200]}"
+        )
+    return positions
+
+
+def _is_integer(word: str) -> bool:
+    return word.isascii() and word.removeprefix("-").isdecimal() and len(word) < 12
+
+
+def _read(root: Path, name: str, count: int, outside: bool) -> tuple[list[int], str]:
+    data = read_inside(root, name, outside=outside, most=2**24)
+    return parse_positions(data, count, root / name), hashlib.sha256(data).hexdigest()
+
+
+def parse_positions(data: bytes, count: int, path: Path) -> list[int]:
+    """The positions in an index file, checked against the number of views.
+
+    Raises:
+        SceneError: for anything but at least one integer in [0, count), none of them twice.
+    """
+    name = path.name
     words = data.decode("utf-8", errors="replace").split()
     for word in words:
-        if not (word.isascii() and word.lstrip("-").isdecimal() and len(word) < 12):
+        if not _is_integer(word):
             raise SceneError(
-                f"{path.name} holds {word[:40]!r}, which is not an integer",
+                f"{name} holds {word[:40]!r}, which is not an integer",
                 where=path,
                 todo="write zero-based positions in the name-sorted list of images, not file names",
             )
     positions = [int(word) for word in words]
     if not positions:
-        raise SceneError(f"{path.name} lists no views", where=path, todo="write one position per line")
-    outside = [p for p in positions if not 0 <= p < registered]
+        raise SceneError(f"{name} lists no views", where=path, todo="write one position per line")
+    outside = [p for p in positions if not 0 <= p < count]
     if outside:
         raise SceneError(
-            f"{path.name} lists position {outside[0]}, but the {registered} registered images have 0 to "
-            f"{registered - 1}",
+            f"{name} lists position {outside[0]}, but the {count} registered images have 0 to {count - 1}",
             where=path,
             cause="positions counted from 1, or a list made for another model" if outside[0] >= 0 else None,
             todo="write zero-based positions in the name-sorted list of registered images",
         )
-    twice = sorted({p for p in positions if positions.count(p) > 1})
-    if twice:
-        raise SceneError(
-            f"{path.name} lists position {twice[0]} twice", where=path, todo="list each view once"
-        )
-    return positions, hashlib.sha256(data).hexdigest()
+    seen: set[int] = set()
+    for p in positions:
+        if p in seen:
+            raise SceneError(f"{name} lists position {p} twice", where=path, todo="list each view once")
+        seen.add(p)
+    return positions

@@ -124,7 +124,7 @@ def make_scene(config: SyntheticConfig | None = None) -> Scene:
 
     import torch
 
-    from datamodules.prepared import hash_views
+    from datamodules.capture import hash_views
     from datamodules.synthetic_noise import disturb_masks, disturb_poses
     from datamodules.synthetic_shape import watering_can
     from visdom_plugin.cameras import Cameras

@@ -85,14 +85,18 @@ FAULTS = {
         ["folder images is missing", "--downscale 2"],
     ),
     "no masks folder": (lambda f: (f / "masks").rename(f / "mask"), ["folder masks is missing"]),
-    "no index files": (lambda f: [p.unlink() for p in f.glob("sparse_*.txt")], ["no sparse_<N>.txt"]),
+    "no training list": (lambda f: (f / "sparse_4.txt").unlink(), ["no sparse_<N>.txt"]),
     "no test list": (lambda f: (f / "sparse_test.txt").unlink(), ["sparse_test.txt is missing"]),
     "missing mask": (lambda f: (f / "masks/train_002.png").unlink(), ["train_002", "no mask"]),
     "missing test mask": (lambda f: (f / "masks/test_001.png").unlink(), ["test_001", "no mask"]),
     "masks shifted by one": (_shift_masks, ["train_000", "no mask", "shifted", "train_004"]),
-    "masks named with the image's ending": (
-        lambda f: [p.rename(p.with_name(p.name + ".png")) for p in (f / "masks").iterdir()],
-        ["no mask", "train_000.png", "named otherwise"],
+    "masks named otherwise": (
+        lambda f: [p.rename(p.with_name("m" + p.name)) for p in (f / "masks").iterdir()],
+        ["no mask", "mtrain_000", "named otherwise"],
+    ),
+    "two masks for one image": (
+        lambda f: (f / "masks/train_001.png.png").write_bytes((f / "masks/train_001.png").read_bytes()),
+        ["more than one mask", "train_001.png.png"],
     ),
     "missing image": (lambda f: (f / "images/train_003.png").unlink(), ["missing", "train_003.png"]),
     "image is a folder": (
@@ -107,8 +111,15 @@ FAULTS = {
     "empty mask": (lambda f: _mask(f, lambda m: m * 0), ["mask is empty", "train_002"]),
     "empty test mask": (lambda f: _mask(f, lambda m: m * 0, "test_002"), ["mask is empty", "test_002"]),
     "mask of zeros and ones": (lambda f: _mask(f, lambda m: m // 255), ["mask is empty", "0 and 1", "255"]),
-    "distorted": (lambda f: _lens(f, "SIMPLE_RADIAL", "50 24 18 0.1"), ["SIMPLE_RADIAL", "image_undistorter"]),
-    "fisheye": (lambda f: _lens(f, "OPENCV_FISHEYE", "50 50 24 18 0 0 0 0"), ["OPENCV_FISHEYE", "undistort"]),
+    "distorted": (
+        lambda f: _lens(f, "THIN_PRISM_FISHEYE", "50 50 24 18 0.1" + " 0" * 7),
+        ["THIN_PRISM_FISHEYE", "image_undistorter"],
+    ),
+    "a lens that bends too far": (
+        lambda f: _lens(f, "SIMPLE_RADIAL", "50 24 18 -90"),
+        ["SIMPLE_RADIAL", "of the 48 x 36 frame"],
+    ),
+    "a lens of NaN": (lambda f: _lens(f, "OPENCV", "50 50 24 18 0 0 nan 0"), ["impossible"]),
     "unknown lens": (lambda f: _lens(f, "FOO", "1 2"), ["unknown lens model FOO"]),
     "wrong number of parameters": (lambda f: _lens(f, "PINHOLE", "50 24 18"), ["PINHOLE needs 4", "line 1"]),
     "focal length zero": (lambda f: _lens(f, "PINHOLE", "0 50 24 18"), ["impossible", "focal lengths 0"]),

@@ -1,0 +1,44 @@
+"""What a caller wants of a scene on disk."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from visdom_plugin.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Request:
+    """How to read a scene; every layout takes the same."""
+
+    views: int | None = None
+    """Number of training views; None takes the smallest index file, or 4 where there is none."""
+    downscale: float = 1
+    """>= 1, how much smaller than the photographs to work."""
+    test: bool = True
+    """False leaves the test views out and does not look at their files."""
+    train_list: str | None = None
+    """Training views by hand: an index file, or positions and names with commas between."""
+    test_list: str | None = None
+    """Test views by hand, in the same way."""
+    frame: int | None = None
+    """Of a video layout (ActorsHQ): which frame; None takes the first there is."""
+    mask_source: Literal["auto", "folder", "alpha"] = "auto"
+    """Where foreground masks are: files, the photographs' alpha channels, or whichever there is; where both
+    are, they must agree."""
+    mask_path: Literal["ignore", "foreground"] = "ignore"
+    """What the files named by `mask_path` in a transforms.json mean: black pixels are to be ignored, which is
+    nerfstudio's meaning, or white pixels are the object."""
+    allow_missing_masks: bool = False
+    """Whether views without a mask are read all the same, with `mask_origins` "missing"."""
+    allow_outside: bool = False
+    """Whether files outside the scene's folder may be read because the data names them."""
+
+    def check(self) -> None:
+        """Raises ConfigError for a field out of range."""
+        if not (math.isfinite(self.downscale) and self.downscale >= 1):
+            raise ConfigError(f"downscale is {self.downscale:g}; it must be 1 or more", where="--downscale")
+        if self.frame is not None and self.frame < 0:
+            raise ConfigError(f"frame is {self.frame}; frames are counted from 0", where="--frame")
