@@ -184,9 +184,9 @@ def encode(
             for g in range(count):
                 total = np.float32(0)
                 for p in range(g * samples, (g + 1) * samples):
-                    strengths[p] *= share
                     total += strengths[p]
-                mean_strengths[(first + g) * levels + level] = total
+                    strengths[p] *= share
+                mean_strengths[(first + g) * levels + level] = total / np.float32(samples)
         _locate_level(
             points, first * samples, count * samples, resolutions[level], dense[level], masks[level],
             offsets[level], strengths, planes, rows, weights,
