@@ -1,0 +1,133 @@
+"""Views without a mask: what stands in for it, and that it teaches nothing wrong."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from datamodules.manager import DataManager
+from datamodules.synthetic import SyntheticConfig, make_scene
+from method_configs.gs_go import QUICK
+from visdom_plugin.errors import SceneError
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.raycast import depth_and_silhouette
+from visdom_plugin.methods.gs_go import GsGo
+from visdom_plugin.scene import Scene, Views
+from visdom_plugin.training.evaluate import evaluate
+from visdom_plugin.training.missing_masks import fill_masks
+from visdom_plugin.training.rundir import hash_views
+
+DOMAIN = VisibleDomain(resolution=48)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return make_scene(SyntheticConfig(size=48, train_views=5, test_views=4))
+
+
+def strip(views, without):
+    """The views with some masks taken away."""
+    masks = tuple(torch.ones_like(m) if i in without else m for i, m in enumerate(views.masks))
+    origins = tuple("missing" if i in without else "given" for i in range(len(views)))
+    return replace(views, masks=masks, mask_origins=origins)
+
+
+def choose(views, kept):
+    parts = ([getattr(views, name)[i] for i in kept] for name in ("images", "masks", "names"))
+    return Views(views.cameras[kept], *parts)
+
+
+@pytest.fixture(scope="module")
+def bare(whole):
+    return replace(whole, train=strip(whole.train, {4}), test=strip(whole.test, {1}))
+
+
+@pytest.fixture(scope="module")
+def others(whole):
+    """The hull of the views that keep their mask."""
+    part = choose(whole.train, [0, 1, 2, 3])
+    return DOMAIN.carve(part.cameras, part.masks)
+
+
+def test_nothing_missing_changes_nothing(whole):
+    assert fill_masks(whole, "error") is whole and fill_masks(whole, "hull") is whole
+
+
+def test_missing_masks_are_an_error_unless_asked_for(bare):
+    with pytest.raises(
+        SceneError, match=r"2 views have no mask: train_004, test_001[\s\S]*--data.missing-masks"
+    ):
+        fill_masks(bare, "error")
+    lonely = replace(bare, train=strip(bare.train, {0, 1, 2, 4}))
+    with pytest.raises(SceneError, match="only 1 training views"):
+        fill_masks(lonely, "hull")
+
+
+@pytest.mark.parametrize("way", ["hull", "colour"])
+def test_the_outline_of_the_others_hull_stands_in_and_does_not_carve(whole, bare, others, way):
+    filled = fill_masks(bare, way, DOMAIN)
+    _, outline = depth_and_silhouette(others, whole.train.cameras[4])
+    assert torch.equal(filled.train.masks[4], outline)
+    # The hull holds the object where the others' masks are right.
+    assert (whole.train.masks[4] & outline).sum() > 0.95 * whole.train.masks[4].sum()
+    assert [filled.train.mask_origin(i) for i in range(5)] == ["given"] * 4 + [way]
+    again = DOMAIN.carve(*filled.train.silhouettes())
+    assert (again.occupancy == others.occupancy).all() and (again.bounds == others.bounds).all()
+    _, seen = depth_and_silhouette(others, whole.test.cameras[1])
+    assert torch.equal(filled.test.masks[1], seen) and filled.test.mask_origin(1) == "hull"
+    assert filled.test.masks[0] is whole.test.masks[0] and len(filled.test.masks[:]) == 4
+    if way == "colour":
+        assert torch.equal(filled.train.ignored(4), ~outline) and filled.train.ignored(0) is None
+    else:
+        assert not filled.train.ignore
+    assert hash_views(filled.train) not in (hash_views(whole.train), hash_views(bare.train))
+
+
+def test_what_was_ignored_stays_ignored(bare, others):
+    ignore = torch.zeros(48, 48, dtype=torch.bool)
+    ignore[:, 20:24] = True
+    known = replace(bare, train=replace(bare.train, ignore=(ignore, None, None, None, ignore)))
+    filled = fill_masks(known, "colour", DOMAIN)
+    assert filled.train.ignored(4)[:, 20:24].all() and torch.equal(filled.train.ignored(0), ignore)
+
+
+def train(scene, hull, steps):
+    config = replace(QUICK, steps=steps, initial_points=1500, hull=DOMAIN)
+    method = GsGo(config)
+    method.setup(scene.train, [], hull=hull, device=CPU, seed=0)
+    data = DataManager(scene.train, 0)
+    for step in range(steps):
+        losses = method.train_step(data.view_batch(step), step)
+        sum(losses.values()).backward()
+        method.optimise(step)
+    return method
+
+
+def test_a_view_for_colour_only_gives_no_mask_loss_and_no_lesson_outside(bare, others):
+    """What the photograph shows beside the others' hull makes no difference to any step."""
+    filled = fill_masks(bare, "colour", DOMAIN)
+    images = list(filled.train.images)
+    images[4] = torch.where(filled.train.ignored(4)[..., None], 255 - images[4], images[4])
+    changed = replace(filled, train=replace(filled.train, images=tuple(images)))
+    states = [train(scene, others, 12).state_dict() for scene in (filled, changed)]
+    assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
+    method = train(filled, others, 5)
+    data = DataManager(filled.train, 0)
+    assert "mask" in method.train_step(data.view(0), 5) and "mask" not in method.train_step(data.view(4), 5)
+
+
+@pytest.mark.slow
+def test_a_view_for_colour_only_is_better_than_none(whole):
+    """Two of five masks are missing: the colours of those two views help."""
+    few = [0, 1, 2]
+    domain = replace(DOMAIN, k=3)
+    bare = replace(whole, train=strip(whole.train, {3, 4}))
+    coloured = fill_masks(bare, "colour", domain)
+    left_out = Scene(whole.name, choose(whole.train, few), whole.test)
+    hull = domain.carve(*coloured.train.silhouettes())
+    scores = {
+        name: evaluate(train(scene, hull, 100), whole.test, reference_hull=None, device=CPU)["test"]["psnr"]
+        for name, scene in (("colour", coloured), ("left out", left_out))
+    }
+    assert scores["colour"] > scores["left out"]
