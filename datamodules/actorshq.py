@@ -77,7 +77,7 @@ def read(root: Path, request: Request) -> Capture:
             f"{len(cameras) - len(there)} of {len(cameras)} cameras have no photograph of frame {frame}"
         )
         log.warning("%s: %s", root, notes[0])
-    source = {"frame": frame, "scale": scale}
+    source = {"frame_number": frame, "scale": scale}
     box = read_box(root, frame, request)
     if box is not None:
         source["aabb"] = box.tolist()

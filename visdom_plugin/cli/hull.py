@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from visdom_plugin.cli.errors import run
+from visdom_plugin.cli.options import Reading, read_options
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import Box, VisibleDomain
 
@@ -19,7 +20,7 @@ _DEFAULT = VisibleDomain()
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Reading):
     """Carve the visible-domain hull of a scene from its cameras and masks.
 
     Prints what it measured; --out writes the mesh (.ply) or the voxel grid (.npz).
@@ -106,11 +107,7 @@ def _main(argv: Sequence[str]) -> None:
 
     scene = open_scene(
         options.folder or options.data,
-        views=options.views,
-        downscale=options.downscale,
-        seed=options.seed,
-        missing_masks=options.missing_masks,
-        mask_source=options.mask_source,
+        **read_options(options),
         fill=False,
     )
     masks = None

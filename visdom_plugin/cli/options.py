@@ -13,15 +13,40 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from datamodules.detect import FORMATS
 from visdom_plugin import registry
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.training.settings import as_plain, differences, from_plain
 
 WORD = "method:"
+DataFormat = Literal[tuple(FORMATS)]
+READING = (
+    "views", "downscale", "seed", "missing_masks", "mask_source", "data_format", "train_list", "test_list",
+    "frame", "mask_path", "allow_outside",
+)  # fmt: skip
+"""Common options that say how a scene is read, kept in run.json to read it again."""
 
 
 @dataclass(frozen=True)
-class Common:
+class Reading:
+    """Options of every command that opens a scene on disk."""
+
+    data_format: DataFormat | None = None
+    """How the scene lies on disk; by default recognised."""
+    train_list: str | None = None
+    """Training views by hand in place of --views: an index file, or positions and names with commas between."""
+    test_list: str | None = None
+    """Test views by hand, in the same way."""
+    frame: int | None = None
+    """Which frame of a video layout (ActorsHQ); by default the first there is."""
+    mask_path: Literal["ignore", "foreground"] = "ignore"
+    """What mask_path in a transforms.json names: black is to be ignored (nerfstudio), or white is the object."""
+    allow_outside: bool = False
+    """Read files outside the scene's folder when the scene names them."""
+
+
+@dataclass(frozen=True)
+class Common(Reading):
     """Options of every training run."""
 
     data: Path | None = None
@@ -59,7 +84,7 @@ class Common:
     """Print nothing but errors."""
 
 
-SAVED = ("data", "views", "downscale", "missing_masks", "mask_source", "seed", "device", "budget")
+SAVED = ("data", *READING, "device", "budget")
 """Common options that a config file holds beside `method` and `settings`."""
 
 
@@ -122,6 +147,15 @@ def parse(argv: Sequence[str], prog: str = "visdom-train") -> Request:
     )
     common = Common(**{f.name: getattr(parsed, f.name) for f in fields(Common)})
     return Request(preset, parsed.method, replace(common, budget=budget), note)
+
+
+def read_options(options: Any) -> dict[str, Any]:
+    """How a command's options say that the scene is read; index files by their full path."""
+    found = {name: getattr(options, name) for name in READING}
+    for name in ("train_list", "test_list"):
+        if found[name] is not None and Path(found[name]).is_file():
+            found[name] = str(Path(found[name]).resolve())
+    return found
 
 
 def dump(request: Request) -> str:

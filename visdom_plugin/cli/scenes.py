@@ -60,6 +60,7 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None) -> Scene:
         CheckpointError: when what is found there is not what the run was trained on.
         SceneError: when it cannot be read.
     """
+    from visdom_plugin.cli.options import READING
     from visdom_plugin.training.rundir import hash_views
 
     noted = record["data"]
@@ -68,14 +69,7 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None) -> Scene:
         raise CheckpointError(
             f"the run's scene is not at {path} any more", where=run, todo="say where it is with --data DIR"
         )
-    scene = open_scene(
-        path,
-        views=noted["views"],
-        downscale=noted["downscale"],
-        seed=noted["seed"],
-        missing_masks=noted.get("missing_masks", "error"),
-        mask_source=noted.get("mask_source", "auto"),
-    )
+    scene = open_scene(path, **{name: noted[name] for name in READING if name in noted})
     if hash_views(scene.train) != noted["hashes"]["train_views"]:
         raise CheckpointError(
             f"the scene at {path or '(built-in)'} is not the one this run was trained on",

@@ -9,9 +9,6 @@ from pathlib import Path
 
 from visdom_plugin.cli import errors, options
 
-READING = ("views", "downscale", "seed", "missing_masks", "mask_source")
-"""Common options that say how the scene is read, kept in run.json to read it again."""
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit status."""
@@ -31,7 +28,7 @@ def _train(argv: Sequence[str]) -> None:
     from visdom_plugin.scene import describe_masks
     from visdom_plugin.training.run import train
 
-    asked = {name: getattr(common, name) for name in READING}
+    asked = options.read_options(common)
     scene = open_scene(common.data, **asked)
     folder = common.out or default_run_dir(scene.name, len(scene.train), request.preset.name, common.seed)
     if not common.quiet:
