@@ -131,13 +131,12 @@ def _hexagons(begin, end, frame, distances, radius, random, unit, steps, std_sca
                 mirrored = section % 2 == 1
                 turn = real(math.pi / 6) if mirrored else real(0)
             cos, sin = math.cos(turn), math.sin(turn)
+            point, deviation = points[ray, section], std[ray, section]
             for j in range(6):
                 t = base + scale * steps[j]
                 across = t * wide
                 c, s = unit[j, 0], -unit[j, 1] if mirrored else unit[j, 1]
                 x, y = across * (c * cos - s * sin), across * (c * sin + s * cos)
-                std[ray, section, j] = std_scale * across
+                deviation[j] = std_scale * across
                 for axis in range(3):
-                    points[ray, section, j, axis] = (
-                        x * f[0, axis] + y * f[1, axis] + t * f[2, axis] + f[3, axis]
-                    )
+                    point[j, axis] = x * f[0, axis] + y * f[1, axis] + t * f[2, axis] + f[3, axis]

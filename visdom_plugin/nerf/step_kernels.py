@@ -71,37 +71,28 @@ def sample(begin, end, edges, weights, jitter, out):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def resample_blurred(begin, end, edges, weights, at, half_width, out):
-    """Two fingers go along the edges, one for the point minus the half width, one for the point plus it."""
-    n = weights.shape[1]
-    mass, integral = np.empty(n + 1), np.empty(n + 1)
-    index, value = np.zeros(2, np.int64), np.empty(2)
+    """Once along the edges for the points plus the half width, once for those minus it."""
+    n, points = weights.shape[1], at.shape[1]
+    mass, integral, density = np.zeros(n + 1), np.zeros(n + 1), np.zeros(n + 1)
+    running = np.empty(points)
     for ray in range(begin, end):
-        mass[0], integral[0] = 0.0, 0.0
+        t, w, x = edges[ray], weights[ray], at[ray]
         for i in range(n):
-            width = np.float64(edges[ray, i + 1]) - edges[ray, i]
-            mass[i + 1] = mass[i] + weights[ray, i]
-            integral[i + 1] = integral[i] + width * (mass[i] + 0.5 * weights[ray, i])
-        index[:] = 0
-        previous = 0.0
-        for k in range(at.shape[1]):
-            for side in range(2):
-                x = at[ray, k] + (2 * side - 1) * half_width
-                i = index[side]
-                while i < n and edges[ray, i + 1] <= x:
+            width = np.float64(t[i + 1]) - t[i]
+            density[i] = 0.5 * w[i] / width if width > 0 else 0.0
+            mass[i + 1] = mass[i] + w[i]
+            integral[i + 1] = integral[i] + width * (mass[i] + 0.5 * w[i])
+        for sign in (-1, 1):
+            i = 0
+            for k in range(points):
+                shifted = x[k] + sign * half_width
+                while i < n and t[i + 1] <= shifted:
                     i += 1
-                index[side] = i
-                if i == n:
-                    value[side] = integral[n] + mass[n] * (x - edges[ray, n])
-                elif x <= edges[ray, 0]:
-                    value[side] = 0.0
-                else:
-                    offset = x - edges[ray, i]
-                    slope = weights[ray, i] / (np.float64(edges[ray, i + 1]) - edges[ray, i])
-                    value[side] = integral[i] + offset * (mass[i] + 0.5 * offset * slope)
-            now = (value[1] - value[0]) / (2 * half_width)
-            if k > 0:
-                out[ray, k - 1] = now - previous
-            previous = now
+                offset = max(shifted - t[i], 0.0)
+                value = integral[i] + offset * (mass[i] + offset * density[i])
+                running[k] = value if sign < 0 else (value - running[k]) / (2 * half_width)
+        for k in range(points - 1):
+            out[ray, k] = running[k + 1] - running[k]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
