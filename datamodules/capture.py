@@ -20,11 +20,12 @@ import torch
 from torch import Tensor
 
 from datamodules import splits
+from datamodules.lazy import LaterViews
 from datamodules.mask_files import assign_masks, find_ignored, looks_inverted
 from datamodules.paths import check_name, inside, printable, stem
 from datamodules.request import Request
 from datamodules.undistort import Distortion
-from datamodules.view_files import ViewFiles, read_views
+from datamodules.view_files import ViewFiles, ViewReader, spread_out
 from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import SceneError
 from visdom_plugin.scene import Scene, Views
@@ -92,7 +93,8 @@ def open_capture(capture: Capture, request: Request) -> Scene:
 
     With a downscale F the files of `<photographs>_<F>` are taken as they are where that folder exists;
     otherwise photographs are averaged over areas to round(size / F). Masks are averaged in the same way and
-    cut at one half. Intrinsics follow each axis's exact ratio. Only wanted views are decoded, on all cores.
+    cut at one half. Intrinsics follow each axis's exact ratio. Training views are decoded on all cores; the files
+    of test views are checked, and their photographs decoded when they are first looked at.
 
     Raises:
         SceneError: for every fault of the data.
@@ -112,12 +114,15 @@ def open_capture(capture: Capture, request: Request) -> Scene:
     folder, factor = _photographs(capture, downscale, request)
     masks = assign_masks(capture, wanted, request)
     files = [_files(capture, i, folder, masks[i], request) for i in wanted]
-    loaded = read_views(files, calibration, factor, downscale, capture, request)
-    sizes = torch.tensor([[v.image.shape[1], v.image.shape[0]] for v in loaded]).reshape(-1, 2)
-    cameras = calibration.cameras.resized(sizes[:, 0], sizes[:, 1])
+    reader = ViewReader(files, calibration, factor, downscale, capture, request)
     n = len(chosen.train)
-    train = _views(cameras[:n], loaded[:n], [names[i] for i in chosen.train])
-    test = _views(cameras[n:], loaded[n:], [names[i] for i in chosen.test])
+    loaded = spread_out(reader.read, range(n))
+    later = LaterViews(lambda i: reader.read(n + i), spread_out(reader.inspect, range(n, len(files))))
+    sizes = [(v.image.shape[1], v.image.shape[0]) for v in loaded] + [v.size for v in later.inspected]
+    cameras = calibration.cameras.resized(*torch.tensor(sizes).reshape(-1, 2).unbind(1))
+    train = _views(cameras[:n], loaded, [names[i] for i in chosen.train])
+    bent = any(d is not None for d in calibration.distortions[n:])
+    test = _later_views(cameras[n:], later, [names[i] for i in chosen.test], bent=bent)
     _warn_inverted(train)
     name = printable(capture.name or capture.root.resolve().name)
     source = {
@@ -132,7 +137,7 @@ def open_capture(capture: Capture, request: Request) -> Scene:
         **capture.source,
         "hashes": {**chosen.hashes, **hash_views(train)},
     }
-    notes = (f"layout {capture.layout}: {chosen.rule}", *capture.notes)
+    notes = (f"layout {capture.layout}: {chosen.rule}", *capture.notes, *_note_soft(loaded))
     return Scene(name, train, test, capture.units, source, notes=notes)
 
 
@@ -283,6 +288,29 @@ def _views(cameras: Cameras, loaded: Sequence[Any], names: Sequence[str]) -> Vie
         mask_origins=()
         if all(v.masked for v in loaded)
         else tuple("given" if v.masked else "missing" for v in loaded),
+    )
+
+
+def _later_views(cameras: Cameras, later: LaterViews, names: Sequence[str], *, bent: bool) -> Views:
+    seen = later.inspected
+    return Views(
+        cameras=cameras,
+        images=later.field("image"),
+        masks=later.field("mask"),
+        names=tuple(names),
+        mono_depths=later.field("depth") if any(v.deep for v in seen) else (),
+        ignore=later.field("ignore") if bent or any(v.ignoring for v in seen) else (),
+        mask_origins=()
+        if all(v.masked for v in seen)
+        else tuple("given" if v.masked else "missing" for v in seen),
+    )
+
+
+def _note_soft(loaded: Sequence[Any]) -> list[str]:
+    shares = [v.soft for v in loaded if v.masked]
+    mean = sum(shares) / max(len(shares), 1)
+    return [f"soft masks: {mean:.1%} of their pixels are neither black nor white, cut at one half"] * (
+        mean > 1e-3
     )
 
 

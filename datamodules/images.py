@@ -129,6 +129,19 @@ def shrink(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
 
+def shrink_cut_out(image: np.ndarray, opacity: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Area average of an (H, W, 3) uint8 cut-out, each pixel weighted by its opacity (H, W) in [0, 1].
+
+    What is transparent has a colour, too, usually black, which would darken the smaller picture's edges.
+    """
+    if image.shape[:2] == (height, width):
+        return image
+    weight = shrink(opacity.astype(np.float32), width, height)[..., None]
+    colour = shrink(image.astype(np.float32) * opacity[..., None], width, height)
+    mean = np.clip(np.rint(colour / np.maximum(weight, 1e-6)), 0, 255).astype(np.uint8)
+    return np.where(weight > 1e-6, mean, shrink(image, width, height))
+
+
 def shrink_nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """The value nearest to each new pixel centre: depth must not be averaged across edges."""
     rows = ((np.arange(height) + 0.5) * (image.shape[0] / height)).astype(np.int64)

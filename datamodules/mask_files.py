@@ -68,7 +68,8 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> d
             f"{len(missing)} of the images have no mask: {some(missing)}",
             where=path,
             cause=f"masks named otherwise, or shifted by one; {hint}" if hint else None,
-            todo="name each mask like its image, with the ending .png",
+            todo="name each mask like its image, with the ending .png; or say what becomes of views without: "
+            "--data.missing-masks colour|hull",
         )
     if extra:
         log.info(

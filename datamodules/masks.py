@@ -55,7 +55,7 @@ def decode(data: bytes, path: Path) -> Mask:
         return _measured(colour)
     alpha = alpha.astype(np.float32) / full
     # A cut-out's colours are a photograph; only colours that are black and white could be meant as a mask.
-    if colour.min() != colour.max() and _soft(colour) < _AGREED and _differ(colour, alpha):
+    if colour.min() != colour.max() and soft_share(colour) < _AGREED and _differ(colour, alpha):
         raise SceneError(
             "the mask's colours and its alpha channel are two different masks",
             where=path,
@@ -116,12 +116,13 @@ def refuse_empty(mask: np.ndarray, peak: float, path: Path) -> None:
     raise SceneError("the mask is empty: no pixel of it is foreground", where=path, cause=cause, todo=todo)
 
 
-def _measured(opacity: np.ndarray) -> Mask:
-    return Mask(opacity, _soft(opacity))
-
-
-def _soft(opacity: np.ndarray) -> float:
+def soft_share(opacity: np.ndarray) -> float:
+    """Share of the pixels that are neither black nor white."""
     return float(((opacity > _SOFT[0]) & (opacity < _SOFT[1])).mean())
+
+
+def _measured(opacity: np.ndarray) -> Mask:
+    return Mask(opacity, soft_share(opacity))
 
 
 def _differ(one: np.ndarray, other: np.ndarray) -> bool:

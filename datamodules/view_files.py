@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +22,10 @@ from visdom_plugin.errors import SceneError
 
 if TYPE_CHECKING:
     from datamodules.capture import Calibration, Capture
+
+
+_VERSION = 1
+"""Raised when other pixels are made of the same files."""
 
 
 class ViewFiles(NamedTuple):
@@ -46,6 +52,8 @@ class LoadedView(NamedTuple):
     """(H, W) float32."""
     masked: bool
     """False where the data has no mask for it; then `mask` is True everywhere."""
+    soft: float = 0.0
+    """Share of the mask's pixels that are neither black nor white."""
 
 
 class _Job(NamedTuple):
@@ -57,45 +65,114 @@ class _Job(NamedTuple):
     request: Request
 
 
-def read_views(
-    files: Sequence[ViewFiles],
-    calibration: Calibration,
-    factor: float,
-    downscale: float,
-    capture: Capture,
-    request: Request,
-) -> list[LoadedView]:
-    """Decodes some views in parallel.
+class InspectedView(NamedTuple):
+    """What is known of a view whose photograph has not been decoded."""
 
-    Raises:
-        SceneError: for the first view (in the given order) that cannot be read.
-    """
-    import cv2
+    size: tuple[int, int]
+    """Width and height it will have."""
+    masked: bool
+    ignoring: bool
+    """Whether it may have ignored pixels."""
+    deep: bool
+    """Whether it has a depth map."""
+    fingerprint: str
+    """SHA-256 of its files and of all that decides what is made of them."""
 
-    job = _Job(capture.root, capture.mask_folder, factor, downscale, request)
-    cameras = calibration.cameras
-    full = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
-    K = cameras.intrinsics.numpy()
 
-    def read(i: int) -> LoadedView:
+class ViewReader:
+    """Reads views of one request, each by its position, in any thread."""
+
+    def __init__(
+        self,
+        files: Sequence[ViewFiles],
+        calibration: Calibration,
+        factor: float,
+        downscale: float,
+        capture: Capture,
+        request: Request,
+    ):
+        self._job = _Job(capture.root, capture.mask_folder, factor, downscale, request)
+        self._files, self._distortions = files, calibration.distortions
+        cameras = calibration.cameras
+        self._full = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
+        self._K = cameras.intrinsics.numpy()
+
+    def read(self, i: int) -> LoadedView:
+        """Decodes one view.
+
+        Raises:
+            SceneError: for everything wrong with its files.
+        """
+        with self._named(i):
+            return _read_view(self._job, self._files[i], self._full[i], self._K[i], self._distortions[i])
+
+    def inspect(self, i: int) -> InspectedView:
+        """Checks one view's files to their last byte, and that its mask is not empty, without decoding its
+        photograph.
+
+        Raises:
+            SceneError: for everything wrong with them that shows.
+        """
+        with self._named(i):
+            plan = repr((self._full[i], self._K[i].tolist(), self._distortions[i], *self._job[2:4]))
+            return _inspect_view(self._job, self._files[i], self._full[i], plan)
+
+    @contextmanager
+    def _named(self, i: int) -> Iterator[None]:
+        import cv2
+
         try:
-            return _read_view(job, files[i], full[i], K[i], calibration.distortions[i])
+            yield
         except (OSError, ValueError, cv2.error, MemoryError) as error:
             raise SceneError(
-                f"view {printable(files[i].name)} cannot be read: {error}", where=job.root
+                f"view {printable(self._files[i].name)} cannot be read: {error}", where=self._job.root
             ) from error
 
+
+def spread_out(function: Callable[[int], Any], positions: Sequence[int]) -> list[Any]:
+    """`function` of each position, on all cores; the first (in the given order) error is raised."""
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        return list(pool.map(read, range(len(files))))
+        return list(pool.map(function, positions))
+
+
+def _open_photograph(job: _Job, file: ViewFiles, full: tuple[int, int]):
+    """Path, bytes, size and wanted size."""
+    path = inside(job.root, file.image, outside=job.request.allow_outside)
+    data = images.read_file(path)
+    size = images.size_of(data, path)
+    _check_size(size, full, job.factor, path)
+    target = size if job.factor > 1 else tuple(max(1, round(s / job.downscale)) for s in size)
+    return path, data, size, target
+
+
+def _inspect_view(job: _Job, file: ViewFiles, full: tuple[int, int], plan: str) -> InspectedView:
+    path, data, size, target = _open_photograph(job, file, full)
+    state = hashlib.sha256(f"{_VERSION} {plan} {job.request.mask_source}".encode())
+    state.update(data)
+    outside = job.request.allow_outside
+    for relative in (file.mask, file.ignore, file.excluded, file.depth):
+        if relative is not None and (other := inside(job.root, relative, outside=outside)).is_file():
+            state.update(hashlib.sha256(images.read_file(other)).digest())
+    masked = images.has_alpha(data) and job.request.mask_source != "folder"
+    if file.mask is not None or (masked and job.request.allow_missing_masks):
+        soft, mask_path = _read_mask(job, file, size, data, path)
+        masked = soft is not None
+        if masked:
+            masks.refuse_empty(_resize(soft, *target) > 0.5, float(soft.max()), mask_path)
+    if not masked and not job.request.allow_missing_masks:
+        _no_mask(job, path)
+    for relative in (file.ignore, file.excluded):
+        if relative is not None:
+            _read_other(job, relative, size, "mask of ignored pixels")
+    depth = None if file.depth is None else inside(job.root, file.depth, outside=outside)
+    ignoring = file.ignore is not None or file.excluded is not None
+    return InspectedView(target, masked, ignoring, depth is not None and depth.is_file(), state.hexdigest())
 
 
 def _read_view(
     job: _Job, file: ViewFiles, full: tuple[int, int], K: np.ndarray, distortion: Distortion | None
 ) -> LoadedView:
-    path = inside(job.root, file.image, outside=job.request.allow_outside)
-    data = images.read_file(path)
-    size = images.size_of(data, path)
-    _check_size(size, full, job.factor, path)
+    path, data, size, target = _open_photograph(job, file, full)
     soft, mask_path = _read_mask(job, file, size, data, path)
     masked = soft is not None
     if soft is None:
@@ -108,18 +185,24 @@ def _read_view(
         scaled = K * np.array([[size[0] / full[0]], [size[1] / full[1]], [1.0]])
         soft = _resize(soft, *size)
         image, soft, ignore = undistort(scaled, distortion, image, soft, ignore, where=path)
-    target = size if job.factor > 1 else tuple(max(1, round(s / job.downscale)) for s in size)
-    image = images.shrink(image, *target)
     if masked:
         mask = _resize(soft, *target) > 0.5
         masks.refuse_empty(mask, float(soft.max()), mask_path)
     else:
         mask = np.ones(target[::-1], bool)
+    # Colours are stored for what is there: where nothing is, they are anything.
+    cut_out = masked and mask_path == path
+    image = images.shrink_cut_out(image, soft, *target) if cut_out else images.shrink(image, *target)
     if ignore is not None:
         # A pixel that is unknown in part is unknown.
         ignore = torch.from_numpy(images.shrink(ignore.astype(np.float32), *target) > 0)
     return LoadedView(
-        torch.from_numpy(image), torch.from_numpy(mask), ignore, _read_depth(job, file, full, target), masked
+        torch.from_numpy(image),
+        torch.from_numpy(mask),
+        ignore,
+        _read_depth(job, file, full, target),
+        masked,
+        masks.soft_share(soft) if masked else 0.0,
     )
 
 

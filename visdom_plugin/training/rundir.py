@@ -32,7 +32,10 @@ _LOCK = "run.lock"
 
 
 def hash_views(views: Views) -> str:
-    """SHA-256 of everything training can see of the views: pixels, masks, depths, cameras and names."""
+    """SHA-256 of everything training can see of the views: pixels, masks, depths, cameras and names.
+
+    Of views that are decoded on first use, their files are hashed in place of their pixels.
+    """
     digest = hashlib.sha256()
 
     def add(*arrays) -> None:
@@ -43,6 +46,10 @@ def hash_views(views: Views) -> str:
 
     cameras = views.cameras
     add(cameras.intrinsics.double(), cameras.world_from_camera.double(), cameras.width, cameras.height)
+    later = getattr(views.images, "fingerprint", None)
+    if later is not None:
+        digest.update(f"{later} {list(views.names)} {list(views.mask_origins)}".encode())
+        return digest.hexdigest()
     for i, name in enumerate(views.names):
         digest.update(name.encode())
         add(views.images[i], views.masks[i])
