@@ -30,15 +30,18 @@ OBJECT_BOUNDS = {
 @pytest.mark.parametrize("views", [4, 6, 9])
 @pytest.mark.parametrize("name", sorted(OBJECT_BOUNDS))
 def test_bounds_and_coverage(name, views):
-    from datamodules.prepared import load_prepared
+    import datamodules
 
-    train = load_prepared(Path(ROOT) / name, views=views, downscale=1).train
+    train = datamodules.load(Path(ROOT) / name, views=views, downscale=1).train
     low, high = np.array(OBJECT_BOUNDS[name])
     size = high - low
-    # One connected piece: with many views, K = 3 leaves floaters that three of them cannot rule out.
-    hull = VisibleDomain(components="largest").carve(train.cameras, train.masks)
-    assert hull.summary["components"] == 1 and is_closed(hull.to_mesh()[1])
-    # The object's box, less the slack of its own 64^3 grid, lies in the grid; and the grid is not much larger.
-    assert (hull.bounds[0] < low + 0.15 * size).all() and (hull.bounds[1] > high - 0.15 * size).all()
-    assert (hull.bounds[1] - hull.bounds[0]).max() < 1.5 * size.max()
-    assert min(c.covered for c in measure_coverage(hull, train.cameras, train.masks)) > 0.96
+    hull = VisibleDomain(resolution=128).carve(train.cameras, train.masks)
+    assert is_closed(hull.to_mesh()[1])
+    # The object's box, less the slack of its own 64^3 grid, lies in the hull's, which is not much larger. From
+    # 4 views of the temple the space that is inside all masks is 1.3 times as deep as that box.
+    assert (hull.extent[0] < low + 0.15 * size).all() and (hull.extent[1] > high - 0.15 * size).all()
+    most = 1.35 if (name, views) == ("middlebury_temple", 4) else 1.1
+    assert (hull.extent[1] - hull.extent[0] < most * size).all()
+    assert (hull.bounds[1] - hull.bounds[0]).max() < 1.15 * (hull.extent[1] - hull.extent[0]).max()
+    assert hull.summary["bounds_closed"]
+    assert min(c.covered for c in measure_coverage(hull, train.cameras, train.masks)) > 0.965

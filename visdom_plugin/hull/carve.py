@@ -14,6 +14,7 @@ from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.blocks import block_carve, sum_areas
 from visdom_plugin.hull.components import choose_pieces, erase_pieces, find_pieces
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.explain import explaining_pieces
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.region import Region, cube_around, find_region, grid_in
 from visdom_plugin.hull.rule import KeepRule, as_fraction
@@ -61,11 +62,13 @@ def carve(domain: VisibleDomain, cameras: Cameras, masks: Sequence) -> Hull:
             len(inverted),
             len(silhouettes),
         )
+    dropped = hull.summary["components_dropped"]
     log.info(
-        "hull: %s, %d views; %s; %d of %s voxels of %.4g, %d of %d pieces, %.2f s",
+        "hull: %s, %d views; %s; %d of %s voxels of %.4g, %d of %d pieces%s, %.2f s",
         domain.kind, len(silhouettes), hull.summary["agreement_means"], hull.voxels,
         "x".join(map(str, hull.shape)), hull.voxel_size, hull.summary["components"],
-        hull.summary["components_found"], hull.summary["seconds"] + hull.summary["bounds_seconds"],
+        hull.summary["components_found"], dropped and f" ({dropped})",
+        hull.summary["seconds"] + hull.summary["bounds_seconds"],
     )  # fmt: skip
     return hull
 
@@ -92,7 +95,11 @@ def carve_silhouettes(
     pieces = find_pieces(occupancy)
     if len(pieces.sizes) == 0:
         return None
-    keep = choose_pieces(pieces.sizes, domain.components, domain.min_component_fraction)
+    policy = _policy(domain, rule)
+    if policy == "explain":
+        keep = explaining_pieces(pieces, occupancy, grid, silhouettes, areas)
+    else:
+        keep = choose_pieces(pieces.sizes, policy, domain.min_component_fraction)
     if not keep.all():
         erase_pieces(occupancy, pieces, keep)
     ended = time.perf_counter()
@@ -106,6 +113,8 @@ def carve_silhouettes(
         "resolution": domain.resolution,
         "components": int(keep.sum()),
         "components_found": len(keep),
+        "components_rule": policy,
+        "components_dropped": _say_dropped(pieces.sizes, keep, policy, domain.min_component_fraction),
         "voxels_dropped": int(pieces.sizes[~keep].sum()),
         "bounds_closed": closed,
         "dilate_px": domain.dilate_px,
@@ -125,8 +134,7 @@ def _place(domain: VisibleDomain, cameras, silhouettes, rule: KeepRule, areas):
     ball_given = domain.sphere_centre is not None and domain.sphere_radius is not None
     region = None
     if given is None or (needs_ball and not ball_given):
-        drop = {"all": 0.0, "largest": 0.5}.get(domain.components, domain.min_component_fraction)
-        region = _visible_region(domain, cameras, silhouettes, rule, areas, drop)
+        region = _visible_region(domain, cameras, silhouettes, rule, areas)
         if region is None:
             return None
     ball = None
@@ -151,17 +159,37 @@ def _one_view_is_enough(domain: VisibleDomain, rule: KeepRule) -> bool:
     return domain.kind == "traditional" or (domain.kind == "visdom" and rule.least_visible == 1)
 
 
-def _visible_region(domain, cameras, silhouettes, rule: KeepRule, areas, drop: float) -> Region | None:
+def _policy(domain: VisibleDomain, rule: KeepRule) -> str:
+    """What decides about the grid's pieces."""
+    baseline = domain.kind == "unit-sphere" or _one_view_is_enough(domain, rule)
+    return "drop-small" if domain.components == "explain" and baseline else domain.components
+
+
+def _say_dropped(sizes: np.ndarray, keep: np.ndarray, policy: str, min_fraction: float) -> str:
+    if keep.all():
+        return ""
+    why = {
+        "explain": "they explain no foreground that what is kept does not explain",
+        "drop-small": f"below {min_fraction:g} of the largest piece's volume",
+        "largest": "not the largest",
+    }[policy]
+    share = sizes[~keep].sum() / sizes[keep].sum()
+    return f"dropped {np.count_nonzero(~keep)}, {share:.2g} of the volume kept: {why}"
+
+
+def _visible_region(domain, cameras, silhouettes, rule: KeepRule, areas) -> Region | None:
+    def find(rule: KeepRule) -> Region | None:
+        fraction = 0.5 if domain.components == "largest" else domain.min_component_fraction
+        return find_region(cameras, silhouettes, rule, domain.components, fraction, areas=areas)
+
     if domain.kind == "released-go" or (domain.kind == "visdom" and rule.least_visible > 1):
-        return find_region(cameras, silhouettes, rule, drop_below=drop, areas=areas)
+        return find(rule)
     views = len(silhouettes)
     start = keep_rule(replace(domain, kind="visdom"), views).least_visible
     # With K = 1 the views close nothing: the box is that of the usual K.
     start = 3 if start == 1 else start
     for k in range(min(start, views), 0, -1):
-        region = find_region(
-            cameras, silhouettes, rule._replace(least_visible=k), drop_below=drop, areas=areas
-        )
+        region = find(rule._replace(least_visible=k))
         if region is not None:
             return region
     return None

@@ -47,8 +47,12 @@ class VisibleDomain:
     """Lower and upper corner of the grid in world units, in place of automatic bounds."""
     resolution: int = 256
     """Voxels along the grid's longest side."""
-    components: Literal["drop-small", "all", "largest"] = "drop-small"
-    """Which connected pieces (26 neighbours) stay: those not small beside the largest, all, or the largest."""
+    components: Literal["explain", "drop-small", "all", "largest"] = "explain"
+    """Which connected pieces (26 neighbours) stay. "explain": those that cover foreground which no better piece
+    covers, so that thin parts that broke off stay and pieces in front of or behind the object go, whatever their
+    size. "drop-small": those not small beside the largest. "all". "largest". Where one view is enough
+    ("traditional", "unit-sphere", k = 1) "explain" finds the bounds, but of the grid's pieces only small ones are
+    dropped: what single views leave is what tells these kinds from the others."""
     min_component_fraction: float = 0.05
     """Pieces below this fraction of the largest piece's volume are small."""
     dilate_px: int = 0
@@ -73,8 +77,8 @@ class VisibleDomain:
         kinds = ("visdom", "traditional", "unit-sphere", "released-go")
         if self.kind not in kinds:
             refuse(f"kind is {self.kind!r}", f"use one of {', '.join(kinds)}")
-        if self.components not in ("drop-small", "all", "largest"):
-            refuse(f"components is {self.components!r}", "use drop-small, all or largest")
+        if self.components not in ("explain", "drop-small", "all", "largest"):
+            refuse(f"components is {self.components!r}", "use explain, drop-small, all or largest")
         if not 0 <= self.min_component_fraction <= 1:
             refuse(f"min_component_fraction is {self.min_component_fraction}", "use a share in [0, 1]")
         if not 8 <= self.resolution <= 2048:

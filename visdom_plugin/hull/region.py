@@ -14,6 +14,7 @@ import numpy as np
 from visdom_plugin.cameras import Cameras, look_at_point
 from visdom_plugin.hull.blocks import KEPT, MIXED, classify_cells, keep_centres, sum_areas
 from visdom_plugin.hull.components import find_pieces, piece_of
+from visdom_plugin.hull.explain import explaining_pieces
 from visdom_plugin.hull.rule import KeepRule
 from visdom_plugin.hull.votes import Grid, Silhouettes
 
@@ -32,7 +33,7 @@ _MOST_CELLS, _MOST_EMPTY = 2_000_000, 200_000
 _MOST_LABELS = 1 << 24
 _MOST_SIDE = 1 << 15
 _ENOUGH = 1000
-"""Cells inside the region from which the volumes of its pieces can be compared."""
+"""Cells inside the region from which its pieces can be compared."""
 _DOUBLINGS, _PATIENCE = 3, 2
 """How often the first cube is doubled while it is empty, and while the region touches its faces."""
 MARGIN_VOXELS = 2
@@ -49,7 +50,13 @@ class Region(NamedTuple):
 
 
 def find_region(
-    cameras: Cameras, silhouettes: Silhouettes, rule: KeepRule, *, drop_below: float = 0.0, areas=None
+    cameras: Cameras,
+    silhouettes: Silhouettes,
+    rule: KeepRule,
+    components: str = "all",
+    drop_below: float = 0.0,
+    *,
+    areas=None,
 ) -> Region | None:
     """The smallest box known to hold the rule's region, or None when no point can satisfy the rule.
 
@@ -58,8 +65,8 @@ def find_region(
     touches is open, and is clipped to the first cube that holds any of it.
 
     Args:
-        drop_below: leave out pieces with clearly less than this fraction of the largest piece's volume; 0 keeps
-            all.
+        components: which pieces the box must hold: "all"; with "explain" those that explain foreground of their
+            own; with any other policy those of not clearly less than `drop_below` of the largest's volume.
         areas: from `blocks.sum_areas`.
     """
     areas = sum_areas(silhouettes) if areas is None else areas
@@ -70,7 +77,7 @@ def find_region(
     for doubling in range(_DOUBLINGS + 1):
         half = 2.0 * reach * 2**doubling
         start = Grid(centre - half, 2 * half / _START, (_START,) * 3)
-        found = _refine(silhouettes, areas, rule, start, drop_below)
+        found = _refine(silhouettes, areas, rule, start, components, drop_below)
         if found is None:
             continue
         box, touches = found
@@ -95,7 +102,7 @@ def _tensor(array):
     return torch.from_numpy(array)
 
 
-def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, drop_below: float):
+def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, components: str, drop_below: float):
     """Box of the region inside one cube and whether it touches the cube's faces, or None."""
     cells = np.stack(np.unravel_index(np.arange(np.prod(grid.shape)), grid.shape), -1)
     settled = np.zeros((0, 3), np.int64)
@@ -106,8 +113,8 @@ def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, drop_below: float):
         inside = np.ones(len(cells), bool)
         whole = len(cells) - len(mixed)
         inside[whole:] = keep_centres(silhouettes, grid, rule, mixed)
-        if drop_below and inside.sum() >= _ENOUGH:
-            stays = _large_pieces(cells, inside, drop_below)
+        if components != "all" and inside.sum() >= _ENOUGH:
+            stays = _staying(silhouettes, areas, grid, cells, inside, components, drop_below)
             whole = int(stays[:whole].sum())
             cells, inside = cells[stays], inside[stays]
         most = _MOST_CELLS if inside.any() else _MOST_EMPTY
@@ -140,11 +147,11 @@ def _split(cells: np.ndarray) -> np.ndarray:
     return (2 * cells[:, None] + corners).reshape(-1, 3)
 
 
-def _large_pieces(cells: np.ndarray, inside: np.ndarray, fraction: float) -> np.ndarray:
-    """(M,) bool: cells of pieces whose volume is not clearly below `fraction` of the largest's.
+def _staying(silhouettes, areas, grid: Grid, cells, inside, components: str, drop_below: float) -> np.ndarray:
+    """(M,) bool: the cells of pieces that the box must hold.
 
     Pieces are joined through every cell that may hold a part of the region, however thin; their volumes are
-    estimated from the cells' centres.
+    estimated from the cells' centres, their silhouettes are those of the cells.
 
     Args:
         cells: (M, 3) that the rule may keep.
@@ -156,12 +163,15 @@ def _large_pieces(cells: np.ndarray, inside: np.ndarray, fraction: float) -> np.
     while np.prod(((high - low - 1) >> shift) + 1) > _MOST_LABELS:
         shift += 1
     where = (cells - low) >> shift
-    grid = np.zeros(((high - low - 1) >> shift) + 1, bool)
-    grid[tuple(where.T)] = True
-    pieces = find_pieces(grid)
-    labels = piece_of(where, grid.shape, pieces)
+    occupancy = np.zeros(((high - low - 1) >> shift) + 1, bool)
+    occupancy[tuple(where.T)] = True
+    pieces = find_pieces(occupancy)
+    labels = piece_of(where, occupancy.shape, pieces)
+    if components == "explain":
+        coarse = Grid(grid.lower + low * grid.voxel, grid.voxel * 2**shift, occupancy.shape)
+        return explaining_pieces(pieces, occupancy, coarse, silhouettes, areas)[labels]
     volumes = np.bincount(labels, weights=inside, minlength=len(pieces.sizes))
-    return (volumes >= 0.9 * fraction * volumes.max())[labels]
+    return (volumes >= 0.9 * drop_below * volumes.max())[labels]
 
 
 def cube_around(box: np.ndarray, resolution: int) -> Grid:
