@@ -133,7 +133,8 @@ class Cameras:
         """Cameras whose images were resampled to another size, each axis by its own ratio."""
         width = torch.as_tensor(width, device=self.width.device).to(torch.int64).expand(self.shape)
         height = torch.as_tensor(height, device=self.width.device).to(torch.int64).expand(self.shape)
-        ratio = torch.stack([width / self.width, height / self.height, torch.ones_like(width)], -1)
+        sizes = (width.double() / self.width, height.double() / self.height)
+        ratio = torch.stack([*sizes, torch.ones_like(sizes[0])], -1)
         return Cameras(
             self.intrinsics * ratio[..., None].to(self.intrinsics), self.world_from_camera, width, height
         )
