@@ -90,7 +90,8 @@ def _frustum_moments(t0, t1, radius):
 @pytest.mark.parametrize("t0,t1", [(0.0, 1.0), (1.0, 1.01), (2.0, 6.0), (0.1, 900.0)])
 @pytest.mark.parametrize("random", [False, True])
 def test_hexagons_have_the_frustums_moments(t0, t1, random):
-    """Along the axis and in both variances exactly; the products of two axes vanish but for a tenth."""
+    """Mean, variance along and summed variance across are exact. Correlations between axes, which a cone does
+    not have, stay under 0.22 for a section as long as its distance and under 0.003 for a short one."""
     radius = 0.01
     unit = _units(1)
     number = torch.rand(1, 1).double() if random else None
@@ -113,7 +114,7 @@ def test_hexagons_have_the_frustums_moments(t0, t1, random):
     assert float(covariance[0, 0] + covariance[1, 1]) == pytest.approx(2 * across, rel=1e-6)
     scale = covariance.diagonal().sqrt()
     off = (covariance / (scale[:, None] * scale)).fill_diagonal_(0).abs()
-    assert off.max() < 0.45 if t0 < 0.5 * t1 else off.max() < 0.02
+    assert off.max() < (0.22 if t0 < 0.5 * t1 else 0.003)
     torch.testing.assert_close(std[0, 0], 0.5 * radius * local[:, 2] / math.sqrt(2))
 
 

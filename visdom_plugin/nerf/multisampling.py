@@ -1,7 +1,7 @@
 """Six points for each section of a ray's cone, instead of one (Zip-NeRF, section 3 and its supplement).
 
-The points wind along the section as a hexagon twisted into a helix, such that their mean and covariance are
-close to those of the conical section.
+The points wind along the section as a hexagon twisted into a helix. Their mean, their variance along the ray and
+their summed variance across it are the conical section's; those of a long section reach a little past its end.
 """
 
 from __future__ import annotations
