@@ -10,6 +10,7 @@ from torch import Tensor
 from visdom_plugin.threads import spread
 
 POINTS_PER_PIECE = 16384
+BLOCK = 256
 
 
 def contract(points: Tensor, std: Tensor | None = None):
@@ -58,20 +59,24 @@ def _contract_cpu(points: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _contract(begin, end, points, std, out, scaled):
+    """In blocks, each step a loop without branches that the compiler can vectorise."""
     one, two, third = np.float32(1), np.float32(2), np.int32(3)
-    for i in range(begin, end):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        square = x * x + y * y + z * z
-        if square <= one:
-            out[i, 0], out[i, 1], out[i, 2], scaled[i] = x, y, z, std[i]
-            continue
-        q = one / np.sqrt(square)
-        across = q * (two - q)
-        out[i, 0], out[i, 1], out[i, 2] = x * across, y * across, z * across
-        # The cube root of v: a third of the exponent, then Halley's step twice, 2e-7 relative at the end.
-        v = q * across
-        root = np.int32(np.float32(v).view(np.int32) // third + np.int32(0x2A514067)).view(np.float32)
-        for _ in range(2):
-            cube = root * root * root
-            root *= (cube + v + v) / (cube + cube + v)
-        scaled[i] = std[i] * root * root
+    square = np.empty(BLOCK, np.float32)
+    for start in range(begin, end, BLOCK):
+        stop = min(start + BLOCK, end)
+        p, o, s, to = points[start:stop], out[start:stop], std[start:stop], scaled[start:stop]
+        for i in range(stop - start):
+            square[i] = max(p[i, 0] * p[i, 0] + p[i, 1] * p[i, 1] + p[i, 2] * p[i, 2], one)
+        across = square
+        for i in range(stop - start):
+            q = one / np.sqrt(square[i])
+            across[i] = q * (two - q)
+            # The cube root of v: a third of the exponent, then Halley's step twice, 2e-7 relative at the end.
+            v = q * across[i]
+            root = np.int32(np.float32(v).view(np.int32) // third + np.int32(0x2A514067)).view(np.float32)
+            for _ in range(2):
+                cube = root * root * root
+                root *= (cube + v + v) / (cube + cube + v)
+            to[i] = s[i] * root * root
+        for i in range(stop - start):
+            o[i, 0], o[i, 1], o[i, 2] = p[i, 0] * across[i], p[i, 1] * across[i], p[i, 2] * across[i]
