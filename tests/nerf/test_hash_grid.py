@@ -65,7 +65,7 @@ def test_same_as_torch_over_many_blocks():
     """More points than a block holds, and a last block that is not full."""
     layout = HashLayout(levels=5, features=4, base_resolution=7, max_resolution=200, log2_table_size=12)
     table = table_of(layout)
-    for samples in (1, 6, 300):
+    for samples in (1, 6, 256):
         points, scales = drawn(5, 1500 // samples, samples, 3), drawn(6, 1500 // samples, samples, high=0.02)
         results = []
         for backend in BACKENDS:
@@ -217,6 +217,8 @@ def test_mismatches_are_told():
         encode(points[:, :2], table, SMALL)
     with pytest.raises(ValueError, match="scales"):
         encode_mean(points, torch.zeros(3), table, SMALL)
+    with pytest.raises(ValueError, match="256 at most"):
+        encode_mean(torch.zeros(1, 257, 3), torch.zeros(1, 257), table, SMALL)
 
 
 TRITON_PROGRAM = """

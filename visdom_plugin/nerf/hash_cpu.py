@@ -52,10 +52,11 @@ class _Encode(torch.autograd.Function):
         ctx.save_for_backward(points, scales)
         out = torch.empty(groups, layout.width)
         mean_strengths = torch.empty(groups if scales is not None else 0, layout.levels)
-        per_block = max(hash_kernels.BLOCK // max(samples, 1), 1)
-        blocks = -(-groups // per_block)
+        if samples > hash_kernels.BLOCK:
+            raise ValueError(f"groups of {samples} points; the CPU kernels take {hash_kernels.BLOCK} at most")
+        blocks = -(-groups // (hash_kernels.BLOCK // samples))
         spread(
-            hash_kernels.encode, layout.levels * blocks, max(blocks // PIECES_PER_LEVEL, 1), per_block, samples,
+            hash_kernels.encode, layout.levels * blocks, max(blocks // PIECES_PER_LEVEL, 1), samples,
             _flat(points), _flat(scales), _flat(table), layout.features, *_describe(layout),
             _flat(out), _flat(mean_strengths),
         )  # fmt: skip
@@ -68,9 +69,8 @@ class _Encode(torch.autograd.Function):
         points, scales = ctx.saved_tensors
         layout, samples = ctx.layout, ctx.samples
         g_table = torch.empty(layout.rows, layout.features)
-        per_block = max(hash_kernels.BLOCK // max(samples, 1), 1)
         spread(
-            hash_kernels.encode_backward, layout.levels, 1, per_block, samples, _flat(points), _flat(scales),
+            hash_kernels.encode_backward, layout.levels, 1, samples, _flat(points), _flat(scales),
             _flat(g_out), layout.features, *_describe(layout), _flat(g_table),
         )  # fmt: skip
         return g_table, None, None, None

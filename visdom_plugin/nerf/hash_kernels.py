@@ -14,13 +14,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
 
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 """As in splat/arithmetic.py; functions with these flags are always inlined, for the reason given there."""
 
 BLOCK = 256
-"""Points per block, at least; a single group may be larger."""
+"""Points per block, at most; groups are not divided."""
+PLANE = BLOCK + 16
+"""Length of a plane: a constant, else nothing would vectorise, and no power of two, for the sake of the caches."""
 
 U, W = np.uint64, np.uint32
 # Numba widens every result to 64 bits: indices are unsigned, so that they are not tested for being negative, and
@@ -56,10 +60,10 @@ def _weigh(scales, first, count, resolution, strengths):
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
-def _locate(points, first, count, resolution, dense, mask, offset, strengths, planes, rows, weights):
-    """Rows and weights (8 planes of `planes`) of points first .. first + count - 1. NaN counts as 0."""
+def _locate(points, first, count, resolution, dense, mask, offset, strengths, rows, weights):
+    """Rows and weights (8 planes) of points first .. first + count - 1. NaN counts as 0."""
     zero, one = np.float32(0), np.float32(1)
-    r, top, plane = np.float32(resolution), np.int32(resolution - 1), U(planes)
+    r, top, plane = np.float32(resolution), np.int32(resolution - 1), U(PLANE)
     if dense:
         step_y, step_z = W(resolution + 1), W((resolution + 1) * (resolution + 1))
     else:
@@ -111,57 +115,110 @@ def _locate(points, first, count, resolution, dense, mask, offset, strengths, pl
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
-def _locate_level(points, first, count, resolution, dense, mask, offset, strengths, planes, rows, weights):
+def _locate_level(points, first, count, resolution, dense, mask, offset, strengths, rows, weights):
     """`_locate` with `dense` a constant in each of two copies."""
     if dense:
-        _locate(points, first, count, resolution, True, mask, offset, strengths, planes, rows, weights)
+        _locate(points, first, count, resolution, True, mask, offset, strengths, rows, weights)
     else:
-        _locate(points, first, count, resolution, False, mask, offset, strengths, planes, rows, weights)
+        _locate(points, first, count, resolution, False, mask, offset, strengths, rows, weights)
+
+
+def _emit_corners(context, builder, signature, arguments, body):
+    """Emits `body(pointer to a row's features, weight in every lane)` for each of a point's eight corners.
+
+    The arguments are those of the two intrinsics below. `lanes` is a tuple as long as there are lanes:
+    its type carries their number.
+    """
+    table, rows, weights = (
+        context.make_array(signature.args[i])(context, builder, arguments[i]).data for i in (0, 2, 3)
+    )
+    lanes = len(signature.args[1])
+    _, row_at, stride, p = arguments[5:]
+    vector = ir.VectorType(ir.FloatType(), lanes)
+    for corner in range(8):
+        place = builder.add(p, p.type(corner * PLANE))
+        row = builder.zext(builder.load(builder.gep(rows, [place])), p.type)
+        first = builder.gep(table, [builder.add(builder.mul(row, stride), row_at)])
+        weight, spread_out = builder.load(builder.gep(weights, [place])), ir.Constant(vector, ir.Undefined)
+        for lane in range(lanes):
+            spread_out = builder.insert_element(spread_out, weight, ir.IntType(32)(lane))
+        body(builder.bitcast(first, vector.as_pointer()), spread_out)
+
+
+def _vector_at(context, builder, signature, arguments):
+    """Pointer to the point's own features, as a vector."""
+    encoded = context.make_array(signature.args[4])(context, builder, arguments[4]).data
+    vector = ir.VectorType(ir.FloatType(), len(signature.args[1]))
+    return builder.bitcast(builder.gep(encoded, [arguments[5]]), vector.as_pointer())
+
+
+@intrinsic
+def _interpolate(typing_context, table, lanes, rows, weights, out, at, row_at, stride, p):
+    """out[at + lane] += sum over the corners of weight * table[row * stride + row_at + lane], as one vector."""
+
+    def generate(context, builder, signature, arguments):
+        place = _vector_at(context, builder, signature, arguments)
+        products = []
+
+        def add(pointer, weight):
+            products.append(builder.fmul(weight, builder.load(pointer, align=4), flags=("contract",)))
+
+        _emit_corners(context, builder, signature, arguments, add)
+        while len(products) > 1:  # in pairs: one sum after another would wait for the one before
+            pairs = zip(products[::2], products[1::2], strict=True)
+            products = [builder.fadd(a, b, flags=("contract",)) for a, b in pairs]
+        total = builder.fadd(builder.load(place, align=4), products[0], flags=("contract",))
+        builder.store(total, place, align=4)
+        return context.get_dummy_value()
+
+    return types.none(table, lanes, rows, weights, out, *[types.uint64] * 4), generate
+
+
+@intrinsic
+def _distribute(typing_context, table, lanes, rows, weights, source, at, row_at, stride, p):
+    """table[row * stride + row_at + lane] += weight * source[at + lane] for each corner, lanes as a vector."""
+
+    def generate(context, builder, signature, arguments):
+        gradient = builder.load(_vector_at(context, builder, signature, arguments), align=4)
+
+        def add(pointer, weight):
+            product = builder.fmul(weight, gradient, flags=("contract",))
+            total = builder.fadd(builder.load(pointer, align=4), product, flags=("contract",))
+            builder.store(total, pointer, align=4)
+
+        _emit_corners(context, builder, signature, arguments, add)
+        return context.get_dummy_value()
+
+    return types.none(table, lanes, rows, weights, source, *[types.uint64] * 4), generate
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
-def _gather(table, features, rows, weights, planes, samples, groups, out, at, stride):
+def _gather(table, lanes, features, rows, weights, samples, groups, out, at, stride):
     """out[at + g stride + f] = sum over the group's points and their corners of weight * table[row, f]."""
-    wide, plane = U(features), U(planes)
+    wide = U(features)
     for g in range(U(groups)):
         to = U(at) + g * U(stride)
         for f in range(wide):
             out[to + f] = np.float32(0)
         for p in range(g * U(samples), (g + U(1)) * U(samples)):
-            r0, r1 = U(rows[p]) * wide, U(rows[p + plane]) * wide
-            r2, r3 = U(rows[p + U(2) * plane]) * wide, U(rows[p + U(3) * plane]) * wide
-            r4, r5 = U(rows[p + U(4) * plane]) * wide, U(rows[p + U(5) * plane]) * wide
-            r6, r7 = U(rows[p + U(6) * plane]) * wide, U(rows[p + U(7) * plane]) * wide
-            w0, w1, w2, w3 = (
-                weights[p],
-                weights[p + plane],
-                weights[p + U(2) * plane],
-                weights[p + U(3) * plane],
-            )
-            w4, w5 = weights[p + U(4) * plane], weights[p + U(5) * plane]
-            w6, w7 = weights[p + U(6) * plane], weights[p + U(7) * plane]
-            for f in range(wide):
-                low = (w0 * table[r0 + f] + w1 * table[r1 + f]) + (w2 * table[r2 + f] + w3 * table[r3 + f])
-                high = (w4 * table[r4 + f] + w5 * table[r5 + f]) + (w6 * table[r6 + f] + w7 * table[r7 + f])
-                out[to + f] += low + high
+            for f in range(U(0), wide, U(len(lanes))):
+                _interpolate(table, lanes, rows, weights, out, to + f, f, wide, p)
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
-def _scatter(g_table, features, rows, weights, planes, samples, groups, g_out, at, stride):
+def _scatter(g_table, lanes, features, rows, weights, samples, groups, g_out, at, stride):
     """The transpose of `_gather`: adds to the table's gradient, in the order of the points."""
-    wide, plane = U(features), U(planes)
+    wide = U(features)
     for g in range(U(groups)):
         source = U(at) + g * U(stride)
         for p in range(g * U(samples), (g + U(1)) * U(samples)):
-            for c in range(U(8)):
-                row, weight = U(rows[p + c * plane]) * wide, weights[p + c * plane]
-                for f in range(wide):
-                    g_table[row + f] += weight * g_out[source + f]
+            for f in range(U(0), wide, U(len(lanes))):
+                _distribute(g_table, lanes, rows, weights, g_out, source + f, f, wide, p)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def encode(
-    begin, end, groups_per_block, samples, points, scales, table, features,
+    begin, end, samples, points, scales, table, features,
     resolutions, dense, masks, offsets, out, mean_strengths,
 ):  # fmt: skip
     """Encodes items begin .. end - 1: item = level * blocks + block, so that neighbours share a level's table.
@@ -170,10 +227,10 @@ def encode(
     """
     levels = len(resolutions)
     groups = len(points) // (3 * samples)
+    groups_per_block = BLOCK // samples
     blocks = (groups + groups_per_block - 1) // groups_per_block
-    planes = groups_per_block * samples
-    rows, weights = np.empty(8 * planes, np.uint32), np.empty(8 * planes, np.float32)
-    strengths = np.ones(planes, np.float32)
+    rows, weights = np.empty(8 * PLANE, np.uint32), np.empty(8 * PLANE, np.float32)
+    strengths = np.ones(BLOCK, np.float32)
     share = np.float32(1) / np.float32(samples)
     stride = levels * features
     for item in range(begin, end):
@@ -189,30 +246,30 @@ def encode(
                 mean_strengths[(first + g) * levels + level] = total / np.float32(samples)
         _locate_level(
             points, first * samples, count * samples, resolutions[level], dense[level], masks[level],
-            offsets[level], strengths, planes, rows, weights,
+            offsets[level], strengths, rows, weights,
         )  # fmt: skip
         at = first * stride + level * features
         if features == 1:
-            _gather(table, 1, rows, weights, planes, samples, count, out, at, stride)
+            _gather(table, (0,), 1, rows, weights, samples, count, out, at, stride)
         elif features == 2:
-            _gather(table, 2, rows, weights, planes, samples, count, out, at, stride)
+            _gather(table, (0, 0), 2, rows, weights, samples, count, out, at, stride)
         elif features == 4:
-            _gather(table, 4, rows, weights, planes, samples, count, out, at, stride)
+            _gather(table, (0, 0, 0, 0), 4, rows, weights, samples, count, out, at, stride)
         else:
-            _gather(table, features, rows, weights, planes, samples, count, out, at, stride)
+            _gather(table, (0,), features, rows, weights, samples, count, out, at, stride)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def encode_backward(
-    begin, end, groups_per_block, samples, points, scales, g_out, features,
+    begin, end, samples, points, scales, g_out, features,
     resolutions, dense, masks, offsets, g_table,
 ):  # fmt: skip
     """Writes the table's gradient of `end - begin` levels, the finest first: item 0 is the last level."""
     levels = len(resolutions)
     groups = len(points) // (3 * samples)
-    planes = groups_per_block * samples
-    rows, weights = np.empty(8 * planes, np.uint32), np.empty(8 * planes, np.float32)
-    strengths = np.ones(planes, np.float32)
+    groups_per_block = BLOCK // samples
+    rows, weights = np.empty(8 * PLANE, np.uint32), np.empty(8 * PLANE, np.float32)
+    strengths = np.ones(BLOCK, np.float32)
     share = np.float32(1) / np.float32(samples)
     stride = levels * features
     for item in range(begin, end):
@@ -226,14 +283,14 @@ def encode_backward(
                     strengths[p] *= share
             _locate_level(
                 points, first * samples, count * samples, resolutions[level], dense[level], masks[level],
-                offsets[level], strengths, planes, rows, weights,
+                offsets[level], strengths, rows, weights,
             )  # fmt: skip
             at = first * stride + level * features
             if features == 1:
-                _scatter(g_table, 1, rows, weights, planes, samples, count, g_out, at, stride)
+                _scatter(g_table, (0,), 1, rows, weights, samples, count, g_out, at, stride)
             elif features == 2:
-                _scatter(g_table, 2, rows, weights, planes, samples, count, g_out, at, stride)
+                _scatter(g_table, (0, 0), 2, rows, weights, samples, count, g_out, at, stride)
             elif features == 4:
-                _scatter(g_table, 4, rows, weights, planes, samples, count, g_out, at, stride)
+                _scatter(g_table, (0, 0, 0, 0), 4, rows, weights, samples, count, g_out, at, stride)
             else:
-                _scatter(g_table, features, rows, weights, planes, samples, count, g_out, at, stride)
+                _scatter(g_table, (0,), features, rows, weights, samples, count, g_out, at, stride)
