@@ -33,6 +33,7 @@ from datamodules.capture import Calibration, Capture, Frame, pinholes
 from datamodules.paths import check_name, inside, read_inside
 from datamodules.plain_files import csv_number, damaged, parse_csv, parse_npy, size
 from datamodules.request import Request
+from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import SceneError
 from visdom_plugin.rotations import matrix_from_quaternion
 
@@ -83,7 +84,7 @@ def read(root: Path, request: Request) -> Capture:
         source["aabb"] = box.tolist()
 
     def calibrate(wanted: Sequence[int]) -> Calibration:
-        found = _cameras([cameras[i] for i in wanted], path)
+        found = cameras_of([cameras[i] for i in wanted], path)
         return Calibration(found, [None] * len(found))
 
     return Capture(
@@ -192,7 +193,8 @@ def parse_occupancy(data: bytes, path: Path) -> np.ndarray:
     return grid.transpose(2, 1, 0) > 127
 
 
-def _cameras(rows: Sequence[dict], path: Path):
+def cameras_of(rows: Sequence[dict], path: Path) -> Cameras:
+    """Cameras of some rows of calibration.csv."""
     axis = np.array([[row[c] for c in ("rx", "ry", "rz")] for row in rows]).reshape(-1, 3)
     angle = np.linalg.norm(axis, axis=1, keepdims=True)
     if angle.size and not angle.max() < 1e3:

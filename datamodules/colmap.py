@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, text and binary: cameras, registered images and, for those who ask, 3D points.
+"""COLMAP's sparse models, text and binary: cameras and registered images.
 
 Formats after COLMAP's documentation (doc/format.rst): little-endian, poses world to camera as Hamilton
 quaternions (w, x, y, z) and translations, pixel centres at +0.5. Declared counts are compared with the bytes
@@ -12,13 +12,12 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, NoReturn
 
-import numpy as np
 import torch
 
 from datamodules.images import MAX_PIXELS
 from datamodules.paths import inside, read_inside
+from datamodules.plain_files import damaged
 from datamodules.undistort import COEFFICIENTS, Distortion
 from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import SceneError
@@ -70,17 +69,6 @@ class Model:
     images: tuple[Registered, ...]
 
 
-class Points(NamedTuple):
-    """Triangulated points."""
-
-    xyz: np.ndarray
-    """(P, 3) float64 world frame."""
-    rgb: np.ndarray
-    """(P, 3) uint8."""
-    error: np.ndarray
-    """(P,) float64 mean reprojection error in pixels."""
-
-
 def find_model(root: Path) -> str | None:
     """The folder below `root`, "" for itself, that holds a model's cameras and images files."""
     for folder in ("sparse/0", "sparse", "colmap/sparse/0", "colmap_sparse/0", "dense/sparse", ""):
@@ -115,16 +103,6 @@ def read_model(root: Path, folder: str, *, outside: bool = False) -> Model:
         where=root / folder,
         todo="put the model's files there; colmap model_converter turns one form into the other",
     )
-
-
-def read_points(root: Path, folder: str, *, outside: bool = False) -> Points | None:
-    """The model's points3D, binary before text; None where there is no such file."""
-    for suffix, parse in ((".bin", parse_points_binary), (".txt", parse_points_text)):
-        name = f"{folder}/points3D{suffix}".lstrip("/")
-        path = inside(root, name, outside=outside)
-        if path.is_file():
-            return parse(read_inside(root, name, outside=outside), path)
-    return None
 
 
 def cameras_of(model: Model, images: Sequence[Registered]) -> tuple[Cameras, list[Distortion | None]]:
@@ -213,11 +191,7 @@ def _check_pose(image: Registered, folder: Path) -> None:
         )
 
 
-def _damaged(path: Path, what: str, cause: str = "the file is truncated or damaged") -> NoReturn:
-    raise SceneError(what, where=path, cause=cause, todo="copy the file again or export the model again")
-
-
-class _Bytes:
+class ByteReader:
     """A reader that never goes past the end of its file."""
 
     def __init__(self, data: bytes, path: Path):
@@ -232,7 +206,7 @@ class _Bytes:
     def need(self, size: int) -> None:
         left = len(self.data) - self.at
         if size > left:
-            _damaged(self.path, f"{self.path.name} ends too early: {size} more bytes declared, {left} left")
+            damaged(self.path, f"{self.path.name} ends too early: {size} more bytes declared, {left} left")
 
     def count(self, smallest: int) -> int:
         (number,) = self.take("<Q")
@@ -246,26 +220,25 @@ class _Bytes:
     def string(self) -> str:
         end = self.data.find(b"\0", self.at)
         if end < 0:
-            _damaged(self.path, f"{self.path.name} ends inside an image name")
+            damaged(self.path, f"{self.path.name} ends inside an image name")
         raw, self.at = self.data[self.at : end], end + 1
         try:
             return raw.decode("utf-8")
         except UnicodeDecodeError:
-            _damaged(self.path, f"{self.path.name} holds an image name that is not UTF-8: {raw[:40]!r}")
+            damaged(self.path, f"{self.path.name} holds an image name that is not UTF-8: {raw[:40]!r}")
 
     def finish(self) -> None:
         if self.at != len(self.data):
-            _damaged(
-                self.path, f"{self.path.name} goes on for {len(self.data) - self.at} bytes after its end"
-            )
+            damaged(self.path, f"{self.path.name} goes on for {len(self.data) - self.at} bytes after its end")
 
 
 def parse_cameras_binary(data: bytes, path: Path) -> dict[int, Intrinsics]:
-    file, cameras = _Bytes(data, path), {}
+    """Of cameras.bin, by id."""
+    file, cameras = ByteReader(data, path), {}
     for _ in range(file.count(24 + 16)):
         camera_id, model_id, width, height = file.take("<IiQQ")
         if model_id not in MODELS:
-            _damaged(
+            damaged(
                 path,
                 f"camera {camera_id} has the unknown model id {model_id}",
                 cause="a damaged file, or one written by a newer COLMAP",
@@ -277,7 +250,8 @@ def parse_cameras_binary(data: bytes, path: Path) -> dict[int, Intrinsics]:
 
 
 def parse_images_binary(data: bytes, path: Path) -> list[Registered]:
-    file, images = _Bytes(data, path), {}
+    """Of images.bin, in its order; 2D points are passed over."""
+    file, images = ByteReader(data, path), {}
     for _ in range(file.count(4 + 56 + 4 + 1 + 8)):
         image_id, *pose, camera_id = file.take("<I7dI")
         name = file.string()
@@ -287,53 +261,25 @@ def parse_images_binary(data: bytes, path: Path) -> list[Registered]:
     return list(images.values())
 
 
-def parse_points_binary(data: bytes, path: Path) -> Points:
-    """Of points3D.bin, by gathering fixed fields at the offsets that the track lengths give."""
-    file = _Bytes(data, path)
-    count, at, end = file.count(8 + 24 + 3 + 8 + 8), 8, len(data)
-    starts, length = np.empty(count, np.int64), struct.Struct("<Q").unpack_from
-    for i in range(count):
-        if at + 51 > end:
-            file.at = at
-            file.need(51)
-        starts[i] = at
-        at += 51 + 8 * length(data, at + 43)[0]
-    file.at = min(at, end)
-    file.need(at - file.at)
-    file.finish()
-    raw = (
-        np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(8, 43)]
-        if count
-        else np.zeros((0, 35), np.uint8)
-    )
-    return _points(
-        raw[:, :24].copy().view("<f8"), raw[:, 24:27].copy(), raw[:, 27:].copy().view("<f8")[:, 0], path
-    )
-
-
-def _points(xyz: np.ndarray, rgb: np.ndarray, error: np.ndarray, path: Path) -> Points:
-    if not np.isfinite(xyz).all():
-        _damaged(path, f"{path.name} holds points at NaN or infinite places")
-    return Points(xyz, rgb, error)
-
-
 def _add(table: dict, key: int, value, path: Path) -> None:
     if key in table:
-        _damaged(path, f"{path.name} lists the id {key} twice", cause="a damaged or badly merged file")
+        damaged(path, f"{path.name} lists the id {key} twice", cause="a damaged or badly merged file")
     table[key] = value
 
 
-def _lines(data: bytes, path: Path) -> list[str]:
+def text_lines(data: bytes, path: Path) -> list[str]:
+    """The lines of a text file in UTF-8."""
     try:
         return data.decode("utf-8").splitlines()
     except UnicodeDecodeError:
-        _damaged(path, f"{path.name} is not text in UTF-8", cause="a binary or damaged file named .txt")
+        damaged(path, f"{path.name} is not text in UTF-8", cause="a binary or damaged file named .txt")
 
 
 def parse_cameras_text(data: bytes, path: Path) -> dict[int, Intrinsics]:
+    """Of cameras.txt, by id."""
     cameras: dict[int, Intrinsics] = {}
     known = dict(MODELS.values())
-    for number, line in enumerate(_lines(data, path), 1):
+    for number, line in enumerate(text_lines(data, path), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         fields = line.split()
@@ -341,17 +287,20 @@ def parse_cameras_text(data: bytes, path: Path) -> dict[int, Intrinsics]:
             camera_id, model, width, height = int(fields[0]), fields[1], int(fields[2]), int(fields[3])
             params = tuple(map(float, fields[4:]))
         except (IndexError, ValueError):
-            _damaged(path, f"line {number} is not `ID MODEL WIDTH HEIGHT PARAMS...`: {line.strip()[:80]!r}")
+            damaged(path, f"line {number} is not `ID MODEL WIDTH HEIGHT PARAMS...`: {line.strip()[:80]!r}")
         if model in known and len(params) != known[model]:
-            _damaged(path, f"line {number}: {model} needs {known[model]} parameters, {len(params)} given")
+            damaged(path, f"line {number}: {model} needs {known[model]} parameters, {len(params)} given")
         _add(cameras, camera_id, Intrinsics(model, width, height, params), path)
     return cameras
 
 
 def parse_images_text(data: bytes, path: Path) -> list[Registered]:
+    """Of images.txt, in its order; 2D points are passed over."""
     images: dict[int, Registered] = {}
     # Every image has two lines, and the second (its 2D points) may be empty: blank lines count.
-    lines = [(n, line) for n, line in enumerate(_lines(data, path), 1) if not line.lstrip().startswith("#")]
+    lines = [
+        (n, line) for n, line in enumerate(text_lines(data, path), 1) if not line.lstrip().startswith("#")
+    ]
     at = 0
     while at < len(lines):
         number, line = lines[at]
@@ -363,7 +312,7 @@ def parse_images_text(data: bytes, path: Path) -> list[Registered]:
             image_id, camera_id, name = int(fields[0]), int(fields[8]), fields[9]
             pose = tuple(map(float, fields[1:8]))
         except (IndexError, ValueError):
-            _damaged(
+            damaged(
                 path,
                 f"line {number} is not `ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`: {line.strip()[:80]!r}",
                 cause="a damaged file, or the second line of an image (its points, often empty) was removed",
@@ -372,29 +321,10 @@ def parse_images_text(data: bytes, path: Path) -> list[Registered]:
             number, points = lines[at]
             at += 1
             if len(points.split()) % 3:
-                _damaged(
+                damaged(
                     path,
                     f"line {number} is not the list of 2D points of image {name}",
                     cause="the second line of an image (its points, often empty) was removed",
                 )
         _add(images, image_id, Registered(name, pose[:4], pose[4:], camera_id), path)
     return list(images.values())
-
-
-def parse_points_text(data: bytes, path: Path) -> Points:
-    """Of points3D.txt; tracks are not read."""
-    rows = []
-    for number, line in enumerate(_lines(data, path), 1):
-        fields = line.split(maxsplit=8)
-        if not fields or fields[0].startswith("#"):
-            continue
-        try:
-            row = list(map(float, fields[1:8]))
-            fine = len(row) == 7 and all(0 <= c <= 255 for c in row[3:6])
-        except ValueError:
-            fine = False
-        if not fine:
-            _damaged(path, f"line {number} is not `ID X Y Z R G B ERROR TRACK...`: {line.strip()[:80]!r}")
-        rows.append(row)
-    table = np.array(rows, np.float64).reshape(-1, 7)
-    return _points(table[:, :3], table[:, 3:6].astype(np.uint8), table[:, 6], path)

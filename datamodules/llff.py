@@ -19,6 +19,7 @@ from datamodules.capture import Calibration, Capture, Frame, pinholes, sort_fram
 from datamodules.paths import check_name, inside, read_inside
 from datamodules.plain_files import damaged, parse_npy
 from datamodules.request import Request
+from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import SceneError
 
 FILE = "poses_bounds.npy"
@@ -36,7 +37,7 @@ def read(root: Path, request: Request) -> Capture:
 
 
 def parse_poses_bounds(data: bytes, path: Path) -> np.ndarray:
-    """(N, 17) float64, finite where sizes and focal lengths are concerned left to the views in use.
+    """(N, 17) float64; NaN and infinities are left to `cameras_of`, which sees the rows in use alone.
 
     Raises:
         SceneError: not a numeric array of this shape.
@@ -49,6 +50,22 @@ def parse_poses_bounds(data: bytes, path: Path) -> np.ndarray:
             cause="another file of this name",
         )
     return table.astype(np.float64)
+
+
+def cameras_of(rows: np.ndarray, names: Sequence[str], path: Path) -> Cameras:
+    """Cameras of rows (N, 17), at the size that they say.
+
+    Raises:
+        SceneError: impossible sizes, focal lengths or poses, by name.
+    """
+    table = rows[:, :15].reshape(-1, 3, 5)
+    sizes = [_size(hwf, path) for hwf in table[:, :, 4]]
+    focal = table[:, 2, 4]
+    centres = np.array(sizes, np.float64).reshape(-1, 2) / 2
+    # Right, down, forward from down, right, backward.
+    pose = np.stack([table[:, :, 1], table[:, :, 0], -table[:, :, 2], table[:, :, 3]], -1)
+    K = np.stack([focal, focal, centres[:, 0], centres[:, 1]], -1)
+    return pinholes(K, pose, sizes, names=names, where=path)
 
 
 def read_capture(
@@ -73,14 +90,8 @@ def read_capture(
     frames = sort_frames([Frame(name, f"images/{name}") for name in names])
 
     def calibrate(wanted: Sequence[int]) -> Calibration:
-        rows = table[[row_of[frames[i].name] for i in wanted], :15].reshape(-1, 3, 5)
-        sizes = [_size(hwf, path) for hwf in rows[:, :, 4]]
-        focal = rows[:, 2, 4]
-        centres = np.array(sizes, np.float64).reshape(-1, 2) / 2
-        # Right, down, forward from down, right, backward.
-        pose = np.stack([rows[:, :, 1], rows[:, :, 0], -rows[:, :, 2], rows[:, :, 3]], -1)
-        K = np.stack([focal, focal, centres[:, 0], centres[:, 1]], -1)
-        cameras = pinholes(K, pose, sizes, names=[frames[i].name for i in wanted], where=path)
+        names_of = [frames[i].name for i in wanted]
+        cameras = cameras_of(table[[row_of[name] for name in names_of]], names_of, path)
         return Calibration(cameras, [None] * len(cameras))
 
     return Capture(

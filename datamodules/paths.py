@@ -14,6 +14,8 @@ from visdom_plugin.errors import SceneError
 
 MOST_BYTES = 2**31
 """No single file of a scene is larger; its bytes are held in memory while it is read."""
+_LONGEST_NAME, _LONGEST_PATH = 220, 3000
+"""File systems stop at 255 bytes and 4096; the rest is for the endings of masks and side files."""
 _OPTION = "pass --allow-outside if you trust this data"
 
 
@@ -25,11 +27,12 @@ def check_name(relative: str, where: Path, *, outside: bool = False) -> None:
     """
     parts = relative.replace("\\", "/").split("/")
     drive = len(parts[0]) == 2 and parts[0].endswith(":")
-    if not relative.isprintable() or not PurePosixPath(relative).name:
+    fine = relative.isprintable() and len(relative) < _LONGEST_PATH and bool(PurePosixPath(relative).name)
+    if not fine or max(len(part.encode()) for part in parts) > _LONGEST_NAME:
         raise SceneError(
             f"the data names a file in a way that no file is named: {_shown(relative)}",
             where=where,
-            cause="a damaged file, or a name that is not UTF-8",
+            cause="a damaged file, or a name that is endless or not UTF-8",
             todo="rename the file, or correct its name in the data",
         )
     if not outside and (drive or parts[0] == "" or ".." in parts):

@@ -160,7 +160,7 @@ def _inspect_view(job: _Job, file: ViewFiles, full: tuple[int, int], plan: str) 
         if masked:
             masks.refuse_empty(_resize(soft, *target) > 0.5, float(soft.max()), mask_path)
     if not masked and not job.request.allow_missing_masks:
-        _no_mask(job, path)
+        _no_mask(job, file, path)
     for relative in (file.ignore, file.excluded):
         if relative is not None:
             _read_other(job, relative, size, "mask of ignored pixels")
@@ -177,7 +177,7 @@ def _read_view(
     masked = soft is not None
     if soft is None:
         if not job.request.allow_missing_masks:
-            _no_mask(job, path)
+            _no_mask(job, file, path)
         soft = np.ones((1, 1), np.float32)
     image = images.decode_photograph(data, path)
     ignore = _read_ignored(job, file, size)
@@ -218,7 +218,14 @@ def _check_size(size: tuple[int, int], full: tuple[int, int], factor: float, pat
     )
 
 
-def _no_mask(job: _Job, path: Path) -> None:
+def _no_mask(job: _Job, file: ViewFiles, path: Path) -> None:
+    if file.ignore is not None:
+        raise SceneError(
+            f"the photograph has no foreground mask: {file.ignore} says which pixels to ignore",
+            where=path,
+            cause="mask_path has nerfstudio's meaning here",
+            todo="pass --mask-path foreground if these files are white on the object",
+        )
     folder = job.mask_folder
     missing = folder is not None and not (job.root / folder).is_dir()
     raise SceneError(
