@@ -23,6 +23,7 @@ def _train(argv: Sequence[str]) -> None:
         return
     device = options.resolve_device(common.device)
 
+    from visdom_plugin.cli.check import warn_of_faults
     from visdom_plugin.cli.report import say, show_result
     from visdom_plugin.cli.scenes import make_data_manager, open_scene
     from visdom_plugin.scene import describe_masks
@@ -39,6 +40,7 @@ def _train(argv: Sequence[str]) -> None:
         for line in (*describe_masks(scene.train), *scene.notes):
             say(f"data: {line}")
         say(f"run directory: {folder}")
+        warn_of_faults(scene)
     record = train(
         request.preset.name,
         request.config,

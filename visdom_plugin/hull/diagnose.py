@@ -11,7 +11,9 @@ import numpy as np
 
 from visdom_plugin.cameras import Cameras
 from visdom_plugin.hull.blocks import block_carve, sum_areas
-from visdom_plugin.hull.carve import carve_silhouettes, keep_rule
+from visdom_plugin.hull.carve import keep_rule
+from visdom_plugin.hull.coherence import draw_outlines
+from visdom_plugin.hull.covisibility import advise_k
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.raycast import depth_and_silhouette
@@ -140,38 +142,10 @@ def votes_per_k(silhouettes: Silhouettes, grid: Grid, domain: VisibleDomain) -> 
 
 
 def choose_k(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes) -> int:
-    """The largest K of 3, 2, 1 whose hull covers every mask as well as K = 1 does, within 2 % of its pixels.
-
-    Compared at low resolution in one box, 1.5 times that of the largest K that leaves anything.
-    """
-    most = min(3, len(silhouettes))
-    trial = replace(domain, kind="visdom", resolution=COARSE, components="all")
-    masks = [silhouettes.mask(i) for i in range(len(silhouettes))]
-    box = None
-    for k in range(most, 0, -1):
-        hull = carve_silhouettes(replace(trial, k=k, components=domain.components), cameras, silhouettes)
-        if hull is not None:
-            centre, half = hull.extent.mean(0), 0.75 * (hull.extent[1] - hull.extent[0])
-            box = tuple(map(tuple, np.stack([centre - half, centre + half]).tolist()))
-            break
-    if box is None:
-        return most
-    covered = {}
-    for fewer in range(k, 0, -1):
-        hull = carve_silhouettes(replace(trial, k=fewer, bounds=box), cameras, silhouettes)
-        shares = (
-            [0.0] * len(masks)
-            if hull is None
-            else [c.covered for c in measure_coverage(hull, cameras, masks)]
-        )
-        covered[fewer] = np.array(shares)
-    chosen = next(k for k in sorted(covered, reverse=True) if (covered[k] >= covered[1] - 0.02).all())
-    log.info(
-        "k=auto takes K = %d: smallest share of a mask that the hull covers is %s",
-        chosen,
-        ", ".join(f"{v.min():.3f} at K = {k}" for k, v in sorted(covered.items())),
-    )
-    return chosen
+    """The K that `advise_k` advises: the largest of 3, 2, 1 whose hull covers every mask as K = 1 does."""
+    advice = advise_k(draw_outlines(cameras, silhouettes))
+    log.info("k=%s takes %s", domain.k, advice.why)
+    return advice.k
 
 
 def _findings(views, names, per_k, rule: KeepRule, hull: Hull) -> list[str]:

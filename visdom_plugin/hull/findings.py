@@ -1,0 +1,47 @@
+"""What a check says: one finding per fault."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+Sure = Literal["certain", "likely", "possible"]
+
+
+class Finding(NamedTuple):
+    """One thing that is wrong, or worth knowing."""
+
+    kind: str
+    """Machine-readable name: size, empty, full, border, speckled, inverted, duplicate, axes, order, swapped,
+    scale, view, disagreement, clustered, covisibility."""
+    what: str
+    """A sentence with the number behind it."""
+    views: tuple[int, ...]
+    """Positions of the views concerned; empty when it is the whole capture."""
+    sure: Sure
+    evidence: float
+    """The number behind `sure`; what it measures is said in `what`."""
+    todo: str
+    """What to do about it."""
+    note: bool = False
+    """True for what is worth knowing but harms nothing: it does not make a capture faulty."""
+
+
+class Name(Sequence):
+    """Names of views for sentences."""
+
+    def __init__(self, names: Sequence[str]):
+        self._names = list(names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __getitem__(self, index):
+        return self._names[index]
+
+    def all_of(self, views: Sequence[int], most: int = 6) -> str:
+        """ "a", "a and b", "a, b and c", "a, b, ... (9 in all)"."""
+        names = [self._names[i] for i in views]
+        if len(names) > most:
+            return ", ".join(names[:most]) + f", ... ({len(names)} in all)"
+        return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
