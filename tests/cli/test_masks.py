@@ -98,14 +98,12 @@ def test_a_view_without_a_mask_gets_the_others_hull(scene, capsys):
     """With `--cameras train`, the mask that is written for a view that has none is made of the others alone."""
     bare = scene["scene"]
     scene["scene"] = replace(bare, train=strip(bare.train, {2}))
-    flags = ["-k", "2", "--masks-out", "m", "--cameras", "train", "--data.missing-masks", "hull"]
+    flags = ["--masks-out", "m", "--cameras", "train", "--data.missing-masks", "hull"]
     assert hull.main(["somewhere", "--resolution", "32", *flags]) == 0
     out = capsys.readouterr().out
     assert "3 foreground masks" in out and "1 views without a mask" in out and "a/v2.jpg" not in out
     keep = [0, 1, 3]
-    carved = VisibleDomain(k=2, resolution=32).carve(
-        bare.train.cameras[keep], [bare.train.masks[i] for i in keep]
-    )
+    carved = VisibleDomain(resolution=32).carve(bare.train.cameras[keep], [bare.train.masks[i] for i in keep])
     mask = read(Path("m/a_v2.png"))
     assert np.array_equal(mask, depth_and_silhouette(carved, bare.train.cameras[2])[1].numpy())
 
