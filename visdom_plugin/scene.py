@@ -10,7 +10,6 @@ from torch import Tensor
 
 from visdom_plugin.cameras import Cameras
 
-
 MaskOrigin = Literal["given", "missing", "hull", "colour"]
 """given: the data has it. missing: it has none, `masks` is True everywhere and says nothing. hull: the outline
 of the other views' hull stands in for it. colour: the same outline says where the view may be trusted for

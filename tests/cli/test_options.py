@@ -84,7 +84,7 @@ def test_show_config_round_trips(tmp_path, name, budget, steps, lr, views):
     [
         (
             "stps: 3",
-            r"unknown setting 'stps'[\s\S]*method, data, views, downscale, seed, missing_masks, .*, device, budget, settings",
+            r"unknown setting 'stps'[\s\S]*method, data, views, downscale, seed, missing_masks, .*, settings",
         ),
         ("settings: {stps: 3}", r"unknown setting 'settings.stps'[\s\S]*valid names at settings: steps, lr"),
         ("settings: {inner: {w: 3}}", r"'settings.inner.w'[\s\S]*settings.inner: weight"),

@@ -170,6 +170,11 @@ def view_psnr(method: Method, views: Any, device: torch.device) -> Callable[[int
     def measure(step: int) -> float:
         i = step % len(views)
         rgb, _ = render_on_white(method, views.cameras[i], device)
-        return metrics.psnr(metrics.quantise(rgb), metrics.whiten(views.images[i], views.masks[i]))
+        x, y, ignore = (
+            metrics.quantise(rgb),
+            metrics.whiten(views.images[i], views.masks[i]),
+            views.ignored(i),
+        )
+        return metrics.psnr(x, y) if ignore is None else metrics.psnr(x[~ignore], y[~ignore])
 
     return measure
