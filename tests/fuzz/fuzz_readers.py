@@ -23,6 +23,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from datamodules import actorshq, colmap, colmap_points, images, llff, masks, splits, transforms
 from datamodules.request import Request
@@ -197,6 +198,7 @@ def main() -> int:
     parser.add_argument("--only")
     parser.add_argument("--case", type=int)
     options = parser.parse_args()
+    torch.set_num_threads(1)  # waking a second thread costs more than these tiny tensors
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         return run(make_readers(Path(folder)), options)
 
