@@ -90,16 +90,30 @@ def test_torch_march_equals_numba_walk(seed, fill):
 
 @given(st.integers(0, 10**9))
 @settings(max_examples=20, deadline=None)
-def test_brick_distance_is_the_chessboard_distance(seed):
+def test_empty_cubes_ahead_are_the_largest(seed):
     random = np.random.default_rng(seed)
     grid = random.random(random.integers(1, 40, 3)) < 0.0005
     bricks = build_bricks(grid)
     full = np.argwhere(bricks.bits != 0)
     everywhere = np.stack(np.meshgrid(*map(np.arange, bricks.bits.shape), indexing="ij"), -1)
-    for distance, brick in zip(bricks.distance.reshape(-1), everywhere.reshape(-1, 3), strict=True):
-        wanted = np.abs(full - brick).max(1).min() if len(full) else 255
-        assert distance == wanted
+    for octant, ahead in enumerate(bricks.ahead):
+        sign = 1 - 2 * (octant >> np.arange(3) & 1)
+        for edge, brick in zip(ahead.reshape(-1), everywhere.reshape(-1, 3), strict=True):
+            offsets = (full - brick) * sign
+            offsets = offsets[(offsets >= 0).all(1)]
+            assert edge == (offsets.max(1).min() if len(offsets) else 255)
     assert sum(int(b).bit_count() for b in bricks.bits.reshape(-1)) == grid.sum()
+
+
+def test_every_ray_alone_gives_the_same_bits():
+    random = np.random.default_rng(3)
+    hull = random_hull(random, 0.1)
+    origins, directions = (torch.from_numpy(x) for x in random_rays(random, hull, 3000))
+    together = cast(hull, origins, directions)
+    for rows in (slice(0, 1), slice(700, 1100), slice(2999, 3000)):
+        alone = cast(hull, origins[rows], directions[rows])
+        assert all(torch.equal(a, b[rows]) for a, b in zip(alone, together, strict=True))
+    assert together.hit.any()
 
 
 def test_an_origin_inside_enters_at_zero():

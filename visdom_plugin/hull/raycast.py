@@ -1,9 +1,13 @@
 """Where rays enter and leave a hull, and what a camera sees of it: voxel traversal, without a mesh.
 
-The grid is cut into bricks of 4 x 4 x 4 voxels, 64 bits each, with the distance (largest difference over the
-axes, in bricks) from every brick to the nearest one that holds anything. Empty space is crossed in cubes of that
-size (after sphere tracing in distance fields); inside a brick that holds something the ray steps from voxel to
-voxel (Amanatides and Woo 1987). Crossings are exact: t at the plane between two voxels.
+The grid is cut into bricks of 4 x 4 x 4 voxels, 64 bits each, with the edge of the largest empty cube of bricks
+ahead of every brick, for each of the eight octants a ray may go to. Empty space is crossed in such cubes (after
+sphere tracing in distance fields); inside a brick that holds something the ray crosses empty blocks of 2 x 2 x 2
+voxels, and goes from voxel to voxel (Amanatides and Woo 1987). Crossings are exact: t at the plane between voxels.
+
+A step of any kind leaves a box by the same arithmetic, without a branch, in a grid mirrored so that no ray goes
+back. On the CPU rays walk in packs, each ray of a pack one step per round: what one step waits for the next ray's
+step fills, and no wrongly guessed branch throws work away.
 """
 
 from __future__ import annotations
@@ -12,14 +16,22 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import njit
 from torch import Tensor
 
 from visdom_plugin.cameras import Cameras
 from visdom_plugin.hull.hull import Hull, occupied_box
+from visdom_plugin.threads import spread
 
 _BRICK = 4
 _FARTHEST = 255
+_PACK = 256
+"""Rays that walk together; their state, 30 KiB, stays in the first cache."""
+_GRAIN = 16 * _PACK
+_EIGHTH, _EVEN = np.uint64(0x330033), np.uint64(0b101010)
+"""Bits of the first 2 x 2 x 2 voxels of a brick; bits of a place that count in steps of two."""
+_NEVER = 1e300
+"""Inverse of a direction of zero: its planes are never reached."""
 
 
 class Crossing(NamedTuple):
@@ -38,125 +50,132 @@ class Bricks(NamedTuple):
 
     bits: np.ndarray
     """(A, B, C) uint64, bit x + 4 y + 16 z of a brick is voxel (x, y, z) in it."""
-    distance: np.ndarray
-    """(A, B, C) uint8 distance to the nearest brick that is not empty, in bricks, at most 255."""
+    ahead: np.ndarray
+    """(8, A, B, C) uint8 edge of the largest empty cube of bricks that has this one in its corner, at most 255. In
+    octant i + 2 j + 4 k it goes to smaller x if i, smaller y if j, smaller z if k; it may leave the grid."""
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _pack(grid, bits, distance):
+@njit(cache=True, nogil=True)
+def _pack(begin, end, grid, bits):
     nx, ny, nz = grid.shape
-    for a in prange(bits.shape[0]):
+    for a in range(begin, end):
         for x in range(4 * a, min(4 * a + 4, nx)):
             for y in range(ny):
                 base = (x & 3) + 4 * (y & 3)
                 for z in range(nz):
                     if grid[x, y, z]:
                         bits[a, y >> 2, z >> 2] |= np.uint64(1) << np.uint64(base + 16 * (z & 3))
-        for b in range(bits.shape[1]):
-            for c in range(bits.shape[2]):
-                distance[a, b, c] = 0 if bits[a, b, c] else _FARTHEST
 
 
 @njit(cache=True, nogil=True)
-def _spread(distance, order):
-    """One sweep of the chessboard distance transform (Rosenfeld and Pfaltz 1968); two sweeps are exact."""
-    na, nb, nc = distance.shape
-    for p in range(na):
-        a = p if order > 0 else na - 1 - p
-        for q in range(nb):
-            b = q if order > 0 else nb - 1 - q
-            for r in range(nc):
-                c = r if order > 0 else nc - 1 - r
-                best = np.int64(distance[a, b, c])
-                for n in range(13):
-                    i = a - order if n < 9 else a
-                    j = b + n // 3 - 1 if n < 9 else (b - order if n < 12 else b)
-                    k = c + n % 3 - 1 if n < 12 else c - order
-                    if 0 <= i < na and 0 <= j < nb and 0 <= k < nc:
-                        best = min(best, np.int64(distance[i, j, k]) + 1)
-                distance[a, b, c] = best
+def _look_ahead(begin, end, bits, ahead):
+    """Largest empty cubes by dynamic programming: one more than the smallest of the seven bricks ahead."""
+    na, nb, nc = bits.shape
+    for octant in range(begin, end):
+        i, j, k = 1 - 2 * (octant & 1), 1 - 2 * (octant >> 1 & 1), 1 - 2 * (octant >> 2)
+        for p in range(na):
+            a = na - 1 - p if i > 0 else p
+            for q in range(nb):
+                b = nb - 1 - q if j > 0 else q
+                for r in range(nc):
+                    c = nc - 1 - r if k > 0 else r
+                    best = _FARTHEST - 1
+                    for n in range(1, 8):
+                        u, v, w = a + i * (n & 1), b + j * (n >> 1 & 1), c + k * (n >> 2)
+                        if 0 <= u < na and 0 <= v < nb and 0 <= w < nc:
+                            best = min(best, np.int64(ahead[octant, u, v, w]))
+                    ahead[octant, a, b, c] = 0 if bits[a, b, c] else best + 1
 
 
 def build_bricks(occupancy: np.ndarray) -> Bricks:
     """Bricks of an (X, Y, Z) bool grid."""
     shape = tuple(-(-n // _BRICK) for n in occupancy.shape)
-    bits, distance = np.zeros(shape, np.uint64), np.empty(shape, np.uint8)
-    _pack(occupancy.view(np.uint8), bits, distance)
-    _spread(distance, 1)
-    _spread(distance, -1)
-    return Bricks(bits, distance)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _slope(d):
-    """Inverse, constant, step, next plane of a voxel: t at plane p is (p - o) * inverse + constant."""
-    if d > 0:
-        return 1.0 / d, 0.0, 1, 1
-    if d < 0:
-        return 1.0 / d, 0.0, -1, 0
-    return 0.0, np.inf, 0, 1
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _within(value, low, high):
-    # Inside the grid no value is below zero, so cutting off the fraction is the floor.
-    index = np.int64(value)
-    index = index if index > low else low
-    return index if index < high else high
+    bits, ahead = np.zeros(shape, np.uint64), np.empty((8, *shape), np.uint8)
+    spread(_pack, shape[0], 1, occupancy.view(np.uint8), bits)
+    spread(_look_ahead, 8, 1, bits, ahead)
+    return Bricks(bits, ahead)
 
 
 @njit(cache=True, nogil=True)
-def _first_hit(ox, oy, oz, dx, dy, dz, begin, end, nx, ny, nz, bits, distance):
-    """Smallest t in [begin, end) at which the ray is in an occupied voxel; -1 without one. Units of voxels."""
-    ix, cx, sx, px = _slope(dx)
-    iy, cy, sy, py = _slope(dy)
-    iz, cz, sz, pz = _slope(dz)
-    t = begin
-    x, y, z = (
-        _within(ox + t * dx, 0, nx - 1),
-        _within(oy + t * dy, 0, ny - 1),
-        _within(oz + t * dz, 0, nz - 1),
-    )
-    while True:
-        a, b, c = x >> 2, y >> 2, z >> 2
-        free = np.int64(distance[a, b, c])
-        if free == 0:
-            # Voxel by voxel to the end of this brick, without branches on the axis.
-            word = bits[a, b, c]
-            tx, ty, tz = (x + px - ox) * ix + cx, (y + py - oy) * iy + cy, (z + pz - oz) * iz + cz
-            while True:
-                if word >> np.uint64((x & 3) | (y & 3) << 2 | (z & 3) << 4) & np.uint64(1):
-                    return t
-                out = tx if tx < ty else ty
-                out = out if out < tz else tz
-                on_x = np.int64(tx == out)
-                on_y = np.int64(ty == out) & (1 - on_x)
-                on_z = 1 - on_x - on_y
-                x, y, z = x + sx * on_x, y + sy * on_y, z + sz * on_z
-                tx, ty, tz = (x + px - ox) * ix + cx, (y + py - oy) * iy + cy, (z + pz - oz) * iz + cz
-                t = out if out > t else t
-                if ((x >> 2) ^ a) | ((y >> 2) ^ b) | ((z >> 2) ^ c):
-                    break
-        else:
-            # All bricks nearer than `free` are empty: leave their cube at once.
-            x0, x1 = (a - free + 1) << 2, (a + free) << 2
-            y0, y1 = (b - free + 1) << 2, (b + free) << 2
-            z0, z1 = (c - free + 1) << 2, (c + free) << 2
-            tx = ((x1 if px else x0) - ox) * ix + cx
-            ty = ((y1 if py else y0) - oy) * iy + cy
-            tz = ((z1 if pz else z0) - oz) * iz + cz
+def _walk_pack(count, rays, turns, hit, active, size, bits, ahead):
+    """Finds where rays first are in an occupied voxel, in a grid turned so that none goes back; units of voxels.
+
+    Args:
+        count: rays in the pack.
+        rays: (P, 14) float64: origin, direction, inverse of the direction, a point in the voxel where the ray is,
+            t of that point, and t at the end.
+        turns: (P, 6) int64: index of a brick from its turned place (factor for each axis, and offset), bits that
+            turn a place inside a brick, and where the octant of `ahead` starts.
+        hit: (P,) bool, comes out: whether the walk ended in an occupied voxel, at the t that is left in `rays`.
+        active: (P,) uint64, room to work in.
+        size: (3,) float64 voxels of the grid in whole bricks.
+        bits, ahead: flat.
+    """
+    for n in range(count):
+        active[n] = n
+    while count > 0:
+        kept = 0
+        for n in range(count):
+            r = active[n]
+            px, py, pz, begin = rays[r, 9], rays[r, 10], rays[r, 11], rays[r, 12]
+            x, y, z = np.int64(px), np.int64(py), np.int64(pz)
+            brick = turns[r, 3] + (x >> 2) * turns[r, 0] + (y >> 2) * turns[r, 1] + (z >> 2) * turns[r, 2]
+            free = np.int64(ahead[np.uint64(brick + turns[r, 5])])
+            word = bits[np.uint64(brick)]
+            at = np.uint64(((x & 3) | (y & 3) << 2 | (z & 3) << 4) ^ turns[r, 4])
+            full = (word >> at) & np.uint64(1) != 0
+            # Leave the empty cube of bricks ahead, or the empty 2 x 2 x 2 voxels, or the voxel.
+            eighth = word & (_EIGHTH << (at & _EVEN))
+            shift, near = np.int64(free != 0) + np.int64(eighth == 0), free + np.int64(free == 0)
+            x1, y1, z1 = (
+                float(((x >> shift) + near) << shift),
+                float(((y >> shift) + near) << shift),
+                float(((z >> shift) + near) << shift),
+            )
+            ox, oy, oz = rays[r, 0], rays[r, 1], rays[r, 2]
+            tx, ty, tz = (x1 - ox) * rays[r, 6], (y1 - oy) * rays[r, 7], (z1 - oz) * rays[r, 8]
             out = tx if tx < ty else ty
             out = out if out < tz else tz
-            t = out if out > t else t
-            # The axis that leaves goes exactly one past the cube; rounding must not push the others out of it.
-            x = _within(ox + t * dx, x0, x1 - 1)
-            y = _within(oy + t * dy, y0, y1 - 1)
-            z = _within(oz + t * dz, z0, z1 - 1)
-            x = (x1 if px else x0 - 1) if tx == out else x
-            y = (y1 if py else y0 - 1) if ty == out else y
-            z = (z1 if pz else z0 - 1) if tz == out else z
-        if t >= end or x < 0 or y < 0 or z < 0 or x >= nx or y >= ny or z >= nz:
-            return -1.0
+            t = out if out > begin else begin
+            # The axis that leaves goes exactly to the plane; rounding must not push the others over theirs.
+            qx, qy, qz = ox + t * rays[r, 3], oy + t * rays[r, 4], oz + t * rays[r, 5]
+            qx, qy, qz = qx if qx > px else px, qy if qy > py else py, qz if qz > pz else pz
+            qx = qx if qx < x1 - 0.5 else x1 - 0.5
+            qy = qy if qy < y1 - 0.5 else y1 - 0.5
+            qz = qz if qz < z1 - 0.5 else z1 - 0.5
+            qx, qy, qz = x1 if tx == out else qx, y1 if ty == out else qy, z1 if tz == out else qz
+            hit[r] = full
+            rays[r, 9], rays[r, 10], rays[r, 11] = qx, qy, qz
+            rays[r, 12] = begin if full else t
+            on = (not full) & (t < rays[r, 13]) & (qx < size[0]) & (qy < size[1]) & (qz < size[2])
+            active[kept] = r
+            kept += np.int64(on)
+        count = kept
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _set_out(rays, turns, n, begin, end, size, shape):
+    """Fills in the rest of a ray from its origin and direction in the grid as it is."""
+    turns[n, 3], turns[n, 4], octant = 0, 0, 0
+    factor = 1
+    for b in range(3):
+        a = 2 - b
+        o, d = rays[n, a], rays[n, 3 + a]
+        back = d < 0
+        turns[n, a] = -factor if back else factor
+        if back:
+            o, d = size[a] - o, -d
+            turns[n, 3] += factor * (shape[a] - 1)
+            turns[n, 4] |= 3 << (2 * a)
+            octant |= 1 << a
+        factor *= shape[a]
+        rays[n, a], rays[n, 3 + a] = o, d
+        rays[n, 6 + a] = 1.0 / d if d > 0 else _NEVER
+        start = o + begin * d
+        start = start if start > 0 else 0.0
+        rays[n, 9 + a] = start if start < size[a] - 0.5 else size[a] - 0.5
+    turns[n, 5] = octant * factor
+    rays[n, 12], rays[n, 13] = begin, end
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -169,33 +188,52 @@ def _clip_axis(o, d, low, high, near, far):
     return t0 if t0 > near else near, t1 if t1 < far else far
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _cast(origins, directions, lower, scale, box, shape, bits, distance, both, first, last, hit):
+@njit(cache=True, nogil=True)
+def _cast(begin, end, origins, directions, lower, scale, box, shape, bits, ahead, both, first, last, hit):
     # One origin may serve all rays of a camera.
     step = 0 if len(origins) == 1 else 1
-    nx, ny, nz = shape
-    for r in prange(len(directions)):
-        o, d = origins[r * step], directions[r]
-        ox, oy, oz = (o[0] - lower[0]) * scale[0], (o[1] - lower[1]) * scale[1], (o[2] - lower[2]) * scale[2]
-        dx, dy, dz = d[0] * scale[0], d[1] * scale[1], d[2] * scale[2]
-        first[r], last[r], hit[r] = 0, 0, False
-        # Also rejects NaN.
-        if not (dx * dx + dy * dy + dz * dz > 0 and abs(ox) + abs(oy) + abs(oz) < np.inf):
-            continue
-        near, far = _clip_axis(ox, dx, box[0, 0], box[1, 0], 0.0, np.inf)
-        near, far = _clip_axis(oy, dy, box[0, 1], box[1, 1], near, far)
-        near, far = _clip_axis(oz, dz, box[0, 2], box[1, 2], near, far)
-        if not near < far:
-            continue
-        t = _first_hit(ox, oy, oz, dx, dy, dz, near, far, nx, ny, nz, bits, distance)
-        if t < 0:
-            continue
-        first[r], hit[r] = t, True
+    size = np.array([4.0 * shape[0], 4.0 * shape[1], 4.0 * shape[2]])
+    rays, turns, ends = np.empty((_PACK, 14)), np.empty((_PACK, 6), np.int64), np.empty((_PACK, 7))
+    met, active, index = np.empty(_PACK, np.bool_), np.empty(_PACK, np.uint64), np.empty(_PACK, np.int64)
+    r = begin
+    while r < end:
+        count = 0
+        while r < end and count < _PACK:
+            first[r], last[r], hit[r] = 0, 0, False
+            near, far, length, reach = 0.0, np.inf, 0.0, 0.0
+            for a in range(3):
+                o, d = (origins[r * step, a] - lower[a]) * scale[a], directions[r, a] * scale[a]
+                near, far = _clip_axis(o, d, box[0, a], box[1, a], near, far)
+                length += d * d
+                reach += abs(o)
+                rays[count, a], rays[count, 3 + a] = o, d
+            # Also rejects NaN.
+            if near < far and length > 0 and reach < np.inf:
+                # The last exit is the first hit from the other end.
+                for a in range(3):
+                    ends[count, a], ends[count, 3 + a] = (
+                        rays[count, a] + far * rays[count, 3 + a],
+                        -rays[count, 3 + a],
+                    )
+                ends[count, 6], index[count] = far, r
+                _set_out(rays, turns, count, near, far, size, shape)
+                count += 1
+            r += 1
+        _walk_pack(count, rays, turns, met, active, size, bits, ahead)
+        hits = 0
+        for n in range(count):
+            if met[n]:
+                t, far = rays[n, 12], ends[n, 6]
+                first[index[n]], hit[index[n]] = t, True
+                rays[hits, :6] = ends[n, :6]
+                ends[hits, 6], index[hits] = far, index[n]
+                _set_out(rays, turns, hits, 0.0, far - t, size, shape)
+                hits += 1
         if both:
-            # The last exit is the first hit from the other end. Rounding may lose a ray that grazes an edge.
-            px, py, pz = ox + far * dx, oy + far * dy, oz + far * dz
-            back = _first_hit(px, py, pz, -dx, -dy, -dz, 0.0, far - t, nx, ny, nz, bits, distance)
-            last[r] = far - back if back >= 0 else t
+            _walk_pack(hits, rays, turns, met, active, size, bits, ahead)
+            for n in range(hits):
+                # Rounding may lose a ray that grazes an edge.
+                last[index[n]] = ends[n, 6] - rays[n, 12] if met[n] else first[index[n]]
 
 
 def cast(hull: Hull, origins, directions) -> Crossing:
@@ -231,7 +269,9 @@ def _walk(hull: Hull, origins: Tensor, directions: Tensor, shape, *, both: bool)
     hit = np.empty(len(directions), np.bool_)
     lower, scale = np.ascontiguousarray(hull.bounds[0]), 1 / hull.voxel_edges
     box = hull._once("box", lambda: occupied_box(hull.occupancy).astype(float))
-    _cast(origins, directions, lower, scale, box, np.array(hull.shape), *bricks, both, first, last, hit)
+    shaped = (np.array(bricks.bits.shape), bricks.bits.reshape(-1), bricks.ahead.reshape(-1))
+    inputs = (origins, directions, lower, scale, box, *shaped, both)
+    spread(_cast, len(directions), _GRAIN, *inputs, first, last, hit)
     return tuple(torch.from_numpy(x).reshape(shape) for x in (first, last, hit))
 
 
@@ -264,7 +304,7 @@ def march(hull: Hull, origins: Tensor, directions: Tensor) -> Crossing:
 def _march_ahead(hull: Hull, o: Tensor, d: Tensor, begin: Tensor, end: Tensor, alive: Tensor) -> Tensor:
     bricks = hull._once("bricks", lambda: build_bricks(hull.occupancy))
     device = o.device
-    distance = hull._once(("distance", str(device)), lambda: torch.from_numpy(bricks.distance).to(device))
+    distance = hull._once(("distance", str(device)), lambda: torch.from_numpy(bricks.ahead.min(0)).to(device))
     grid = hull._grid_on(device)
     size = torch.tensor(hull.shape, device=device)
     found = torch.full_like(begin, -1.0)
