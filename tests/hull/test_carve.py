@@ -173,7 +173,9 @@ def test_small_pieces_are_dropped():
     for components, pieces in (("all", 2), ("drop-small", 1), ("largest", 1)):
         hull = VisibleDomain(components=components, resolution=80, bounds=BOX).carve(cameras, masks)
         assert hull.summary["components"] == pieces and hull.summary["components_found"] == 2
-    kept = VisibleDomain(components="drop-small", min_component_fraction=0.001, resolution=80).carve(cameras, masks)
+    kept = VisibleDomain(components="drop-small", min_component_fraction=0.001, resolution=80).carve(
+        cameras, masks
+    )
     assert kept.summary["components"] == 2 and kept.contains(np.array([0.9, 0, 0]))
 
 

@@ -15,12 +15,15 @@ from visdom_plugin.hull.blocks import block_carve, sum_areas
 from visdom_plugin.hull.components import choose_pieces, erase_pieces, find_pieces
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.explain import explaining_pieces
-from visdom_plugin.hull.hull import Hull
+from visdom_plugin.hull.hull import Hull, occupied_box
 from visdom_plugin.hull.region import Region, cube_around, find_region, grid_in
 from visdom_plugin.hull.rule import KeepRule, as_fraction
 from visdom_plugin.hull.votes import Grid, Silhouettes, dense_carve, gather_silhouettes
 
 log = logging.getLogger(__name__)
+
+_LOOSE, _TIGHTENINGS = 0.6, 3
+"""Share of the grid's side below which what is kept gets a grid of its own, and how often."""
 
 
 def keep_rule(domain: VisibleDomain, views: int) -> KeepRule:
@@ -86,22 +89,22 @@ def carve_silhouettes(
         return None
     grid, ball, closed = placed
     located = time.perf_counter()
-    if str(device) == "cpu":
-        occupancy = block_carve(silhouettes, grid, rule, areas)
-    else:
-        occupancy = dense_carve(silhouettes, grid, rule, device).cpu().numpy()
-    if ball is not None:
-        _clip_to_ball(occupancy, grid, *ball)
-    pieces = find_pieces(occupancy)
-    if len(pieces.sizes) == 0:
-        return None
     policy = _policy(domain, rule)
-    if policy == "explain":
-        keep = explaining_pieces(pieces, occupancy, grid, silhouettes, areas)
-    else:
-        keep = choose_pieces(pieces.sizes, policy, domain.min_component_fraction)
-    if not keep.all():
-        erase_pieces(occupancy, pieces, keep)
+    found = _carve_grid(domain, policy, silhouettes, rule, areas, grid, ball, device)
+    # Cells tell less than voxels: where the search kept what the voxels then lost, the grid shrinks to the rest.
+    for _ in range(_TIGHTENINGS if policy == "explain" and domain.bounds is None else 0):
+        if found is None:
+            break
+        occupancy, pieces, keep = found
+        box = occupied_box(occupancy)
+        if (box[1] - box[0]).max() > _LOOSE * domain.resolution:
+            break
+        margin = np.array([[-1], [1]]) * (2 + 0.05 * (box[1] - box[0]).max())
+        grid = cube_around(grid.lower + (box + margin) * grid.voxel, domain.resolution)
+        found = _carve_grid(domain, policy, silhouettes, rule, areas, grid, ball, device)
+    if found is None:
+        return None
+    occupancy, pieces, keep = found
     ended = time.perf_counter()
     summary = {
         "kind": domain.kind,
@@ -125,6 +128,28 @@ def carve_silhouettes(
     if ball is not None:
         summary |= {"sphere_centre": [float(x) for x in ball[0]], "sphere_radius": float(ball[1])}
     return Hull(occupancy, grid.bounds, summary)
+
+
+def _carve_grid(
+    domain: VisibleDomain, policy: str, silhouettes, rule: KeepRule, areas, grid: Grid, ball, device
+):
+    """Occupancy after culling, its pieces before and which of them stayed; None for an empty grid."""
+    if str(device) == "cpu":
+        occupancy = block_carve(silhouettes, grid, rule, areas)
+    else:
+        occupancy = dense_carve(silhouettes, grid, rule, device).cpu().numpy()
+    if ball is not None:
+        _clip_to_ball(occupancy, grid, *ball)
+    pieces = find_pieces(occupancy)
+    if len(pieces.sizes) == 0:
+        return None
+    if policy == "explain":
+        keep = explaining_pieces(pieces, occupancy, grid, silhouettes, rule, areas)
+    else:
+        keep = choose_pieces(pieces.sizes, policy, domain.min_component_fraction)
+    if not keep.all():
+        erase_pieces(occupancy, pieces, keep)
+    return occupancy, pieces, keep
 
 
 def _place(domain: VisibleDomain, cameras, silhouettes, rule: KeepRule, areas):

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from visdom_plugin.hull.components import Pieces
+from visdom_plugin.hull.rule import KeepRule
 from visdom_plugin.hull.votes import Grid, Silhouettes, axis_terms
 from visdom_plugin.threads import spread
 
@@ -55,7 +56,7 @@ class _Drawn(NamedTuple):
 
 
 def explaining_pieces(
-    pieces: Pieces, occupancy: np.ndarray, grid: Grid, silhouettes: Silhouettes, areas
+    pieces: Pieces, occupancy: np.ndarray, grid: Grid, silhouettes: Silhouettes, rule: KeepRule, areas
 ) -> np.ndarray:
     """The pieces that explain foreground of their own.
 
@@ -64,6 +65,7 @@ def explaining_pieces(
 
     Args:
         pieces: of `occupancy`, (X, Y, Z) bool, in `grid`.
+        rule: what the pieces satisfy. Undecided cells seldom cover foreground in as many views as it asks for.
         areas: from `blocks.sum_areas`.
 
     Returns:
@@ -77,7 +79,8 @@ def explaining_pieces(
     focal = np.linalg.norm(silhouettes.projections[:, :2, :3], axis=-1).mean(-1)
     canvas = _lay_out(silhouettes, areas, focal * grid.voxel, grid.lower + middle * grid.voxel)
     drawn = _draw(runs, bounds, grid, silhouettes, canvas, focal)
-    return _choose(drawn, canvas)
+    least_views = int(np.argmax(rule.table().any(0)))
+    return _choose(drawn, canvas, least_views)
 
 
 def _shell(pieces: Pieces, occupancy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -183,7 +186,7 @@ def _draw(runs, bounds, grid: Grid, silhouettes: Silhouettes, canvas: _Canvas, f
     return _Drawn(starts, pixels)
 
 
-def _choose(drawn: _Drawn, canvas: _Canvas) -> np.ndarray:
+def _choose(drawn: _Drawn, canvas: _Canvas, least_views: int) -> np.ndarray:
     totals = np.maximum(np.add.reduceat(canvas.foreground, canvas.offsets[:-1], dtype=np.int64), 1)
     counts = np.diff(drawn.starts, axis=1)
     shares = (counts / totals).sum(1)
@@ -193,7 +196,7 @@ def _choose(drawn: _Drawn, canvas: _Canvas) -> np.ndarray:
     explained = np.zeros(len(canvas.foreground), bool)
     better = 0
     for piece in order[1:]:
-        if counts[piece].max() < _LEAST_PIXELS:
+        if counts[piece].max() < _LEAST_PIXELS or np.count_nonzero(counts[piece]) < least_views:
             continue
         while shares[order[better]] >= _BETTER * shares[piece]:
             if keep[order[better]]:

@@ -114,7 +114,7 @@ def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, components: str, dro
         whole = len(cells) - len(mixed)
         inside[whole:] = keep_centres(silhouettes, grid, rule, mixed)
         if components != "all" and inside.sum() >= _ENOUGH:
-            stays = _staying(silhouettes, areas, grid, cells, inside, components, drop_below)
+            stays = _staying(silhouettes, areas, rule, grid, cells, inside, components, drop_below)
             whole = int(stays[:whole].sum())
             cells, inside = cells[stays], inside[stays]
         most = _MOST_CELLS if inside.any() else _MOST_EMPTY
@@ -147,7 +147,9 @@ def _split(cells: np.ndarray) -> np.ndarray:
     return (2 * cells[:, None] + corners).reshape(-1, 3)
 
 
-def _staying(silhouettes, areas, grid: Grid, cells, inside, components: str, drop_below: float) -> np.ndarray:
+def _staying(
+    silhouettes, areas, rule: KeepRule, grid: Grid, cells, inside, components: str, drop_below: float
+) -> np.ndarray:
     """(M,) bool: the cells of pieces that the box must hold.
 
     Pieces are joined through every cell that may hold a part of the region, however thin; their volumes are
@@ -169,7 +171,7 @@ def _staying(silhouettes, areas, grid: Grid, cells, inside, components: str, dro
     labels = piece_of(where, occupancy.shape, pieces)
     if components == "explain":
         coarse = Grid(grid.lower + low * grid.voxel, grid.voxel * 2**shift, occupancy.shape)
-        return explaining_pieces(pieces, occupancy, coarse, silhouettes, areas)[labels]
+        return explaining_pieces(pieces, occupancy, coarse, silhouettes, rule, areas)[labels]
     volumes = np.bincount(labels, weights=inside, minlength=len(pieces.sizes))
     return (volumes >= 0.9 * drop_below * volumes.max())[labels]
 
