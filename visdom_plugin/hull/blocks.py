@@ -10,19 +10,21 @@ the rounding error of the projection, so the result equals the dense vote bit fo
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from visdom_plugin.hull.rule import KeepRule
 from visdom_plugin.hull.votes import Grid, Silhouettes, axis_terms
+from visdom_plugin.threads import spread
 
 DROPPED, KEPT, MIXED = 0, 1, 2
 _UNSEEN, _EMPTY, _FULL, _OPEN = 0, 1, 2, 3
-_TOP, _LEAF, _TASKS = 32, 4, 64
+_TOP, _LEAF = 32, 4
+_GRAIN = 2048
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _sum_areas(pixels, sizes, offsets, table_offsets, tables):
-    for view in prange(len(sizes)):
+@njit(cache=True, nogil=True)
+def _sum_areas(begin, end, pixels, sizes, offsets, table_offsets, tables):
+    for view in range(begin, end):
         width, height = sizes[view]
         stride = width + 1
         table = tables[table_offsets[view] : table_offsets[view] + stride * (height + 1)]
@@ -45,7 +47,8 @@ def sum_areas(silhouettes: Silhouettes) -> tuple[np.ndarray, np.ndarray]:
     counts = (silhouettes.sizes + 1).prod(1)
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
     tables = np.empty(int(counts.sum()), np.int32)
-    _sum_areas(silhouettes.pixels, silhouettes.sizes, silhouettes.offsets, starts, tables)
+    inputs = (silhouettes.pixels, silhouettes.sizes, silhouettes.offsets, starts)
+    spread(_sum_areas, len(silhouettes), 1, *inputs, tables)
     return tables, starts
 
 
@@ -120,10 +123,10 @@ def _decide(table, visible, occupied, unsettled):
     return MIXED
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _classify(blocks, x, y, z, slack, sizes, starts, tables, table, states):
+@njit(cache=True, nogil=True)
+def _classify(begin, end, blocks, x, y, z, slack, sizes, starts, tables, table, states):
     views = len(sizes)
-    for b in prange(len(blocks)):
+    for b in range(begin, end):
         i, j, k = blocks[b, 0], blocks[b, 1], blocks[b, 2]
         visible, occupied, unsettled = 0, 0, 0
         for view in range(views):
@@ -153,14 +156,15 @@ def classify_cells(
     terms = axis_terms(silhouettes.projections, [grid.planes(a) for a in range(3)])
     tables, starts = areas
     states = np.empty(len(cells), np.uint8)
-    _classify(cells, *terms, rounding_bounds(terms), silhouettes.sizes, starts, tables, rule.table(), states)
+    inputs = (cells, *terms, rounding_bounds(terms), silhouettes.sizes, starts, tables, rule.table())
+    spread(_classify, len(cells), _GRAIN, *inputs, states)
     return states
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _keep_centres(cells, x, y, z, sizes, offsets, pixels, table, kept):
+@njit(cache=True, nogil=True)
+def _keep_centres(begin, end, cells, x, y, z, sizes, offsets, pixels, table, kept):
     views = len(sizes)
-    for b in prange(len(cells)):
+    for b in range(begin, end):
         i, j, k = cells[b, 0], cells[b, 1], cells[b, 2]
         visible, occupied = 0, 0
         for view in range(views):
@@ -179,8 +183,8 @@ def keep_centres(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, cells: np
     """(M,) bool: what the rule says of the centres of some cells (M, 3) of a grid."""
     terms = axis_terms(silhouettes.projections, [grid.centres(a) for a in range(3)])
     kept = np.empty(len(cells), np.bool_)
-    table = rule.table()
-    _keep_centres(cells, *terms, silhouettes.sizes, silhouettes.offsets, silhouettes.pixels, table, kept)
+    inputs = (cells, *terms, silhouettes.sizes, silhouettes.offsets, silhouettes.pixels, rule.table())
+    spread(_keep_centres, len(cells), _GRAIN, *inputs, kept)
     return kept
 
 
@@ -240,76 +244,72 @@ def _vote_leaf(
                 m += 1
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _carve(x, y, z, slack, sizes, offsets, pixels, starts, tables, table, top, leaf, tasks, out):
+@njit(cache=True, nogil=True)
+def _carve(begin, end, x, y, z, slack, sizes, offsets, pixels, starts, tables, table, out):
     nx, ny, nz = out.shape
     views = len(sizes)
-    bx, by, bz = (nx + top - 1) // top, (ny + top - 1) // top, (nz + top - 1) // top
-    total = bx * by * bz
-    for task in prange(tasks):
-        deepest = 64
-        corner = np.empty((deepest, 3), np.int64)
-        counts = np.empty((deepest, 4), np.int64)
-        open_views = np.empty((deepest, views), np.int64)
-        still_open = np.empty(views, np.int64)
-        seen = np.empty(leaf * leaf * leaf, np.int64)
-        inside = np.empty(leaf * leaf * leaf, np.int64)
-        for block in range(task, total, tasks):
-            corner[0, 0] = block // (by * bz) * top
-            corner[0, 1] = block // bz % by * top
-            corner[0, 2] = block % bz * top
-            counts[0, 0], counts[0, 1], counts[0, 2], counts[0, 3] = top, 0, 0, views
-            for view in range(views):
-                open_views[0, view] = view
-            height = 1
-            while height > 0:
-                height -= 1
-                i0, j0, k0 = corner[height, 0], corner[height, 1], corner[height, 2]
-                size, visible, occupied = counts[height, 0], counts[height, 1], counts[height, 2]
-                i1, j1, k1 = min(i0 + size, nx), min(j0 + size, ny), min(k0 + size, nz)
-                count = 0
-                for q in range(counts[height, 3]):
-                    view = open_views[height, q]
-                    said = _judge(
-                        view, i0, i1 - 1, j0, j1 - 1, k0, k1 - 1, x, y, z, slack, sizes, starts, tables
-                    )
-                    if said == _OPEN:
-                        still_open[count] = view
-                        count += 1
-                    elif said == _FULL:
-                        visible += 1
-                        occupied += 1
-                    elif said == _EMPTY:
-                        visible += 1
-                state = _decide(table, visible, occupied, count)
-                if state == DROPPED:
+    by, bz = -(-ny // _TOP), -(-nz // _TOP)
+    deepest = 64
+    corner = np.empty((deepest, 3), np.int64)
+    counts = np.empty((deepest, 4), np.int64)
+    open_views = np.empty((deepest, views), np.int64)
+    still_open = np.empty(views, np.int64)
+    seen = np.empty(_LEAF * _LEAF * _LEAF, np.int64)
+    inside = np.empty(_LEAF * _LEAF * _LEAF, np.int64)
+    for block in range(begin, end):
+        corner[0, 0] = block // (by * bz) * _TOP
+        corner[0, 1] = block // bz % by * _TOP
+        corner[0, 2] = block % bz * _TOP
+        counts[0, 0], counts[0, 1], counts[0, 2], counts[0, 3] = _TOP, 0, 0, views
+        for view in range(views):
+            open_views[0, view] = view
+        height = 1
+        while height > 0:
+            height -= 1
+            i0, j0, k0 = corner[height, 0], corner[height, 1], corner[height, 2]
+            size, visible, occupied = counts[height, 0], counts[height, 1], counts[height, 2]
+            i1, j1, k1 = min(i0 + size, nx), min(j0 + size, ny), min(k0 + size, nz)
+            count = 0
+            for q in range(counts[height, 3]):
+                view = open_views[height, q]
+                said = _judge(view, i0, i1 - 1, j0, j1 - 1, k0, k1 - 1, x, y, z, slack, sizes, starts, tables)
+                if said == _OPEN:
+                    still_open[count] = view
+                    count += 1
+                elif said == _FULL:
+                    visible += 1
+                    occupied += 1
+                elif said == _EMPTY:
+                    visible += 1
+            state = _decide(table, visible, occupied, count)
+            if state == DROPPED:
+                continue
+            if state == KEPT:
+                for i in range(i0, i1):
+                    for j in range(j0, j1):
+                        out[i, j, k0:k1] = 1
+                continue
+            if size <= _LEAF:
+                _vote_leaf(
+                    i0, i1, j0, j1, k0, k1, count, still_open, visible, occupied,
+                    x, y, z, sizes, offsets, pixels, table, seen, inside, out,
+                )  # fmt: skip
+                continue
+            step = size // 2
+            for child in range(8):
+                ci, cj, ck = (
+                    i0 + (child & 1) * step,
+                    j0 + (child >> 1 & 1) * step,
+                    k0 + (child >> 2) * step,
+                )
+                if ci >= nx or cj >= ny or ck >= nz:
                     continue
-                if state == KEPT:
-                    for i in range(i0, i1):
-                        for j in range(j0, j1):
-                            out[i, j, k0:k1] = 1
-                    continue
-                if size <= leaf:
-                    _vote_leaf(
-                        i0, i1, j0, j1, k0, k1, count, still_open, visible, occupied,
-                        x, y, z, sizes, offsets, pixels, table, seen, inside, out,
-                    )  # fmt: skip
-                    continue
-                step = size // 2
-                for child in range(8):
-                    ci, cj, ck = (
-                        i0 + (child & 1) * step,
-                        j0 + (child >> 1 & 1) * step,
-                        k0 + (child >> 2) * step,
-                    )
-                    if ci >= nx or cj >= ny or ck >= nz:
-                        continue
-                    corner[height, 0], corner[height, 1], corner[height, 2] = ci, cj, ck
-                    counts[height, 0], counts[height, 1] = step, visible
-                    counts[height, 2], counts[height, 3] = occupied, count
-                    for q in range(count):
-                        open_views[height, q] = still_open[q]
-                    height += 1
+                corner[height, 0], corner[height, 1], corner[height, 2] = ci, cj, ck
+                counts[height, 0], counts[height, 1] = step, visible
+                counts[height, 2], counts[height, 3] = occupied, count
+                for q in range(count):
+                    open_views[height, q] = still_open[q]
+                height += 1
 
 
 def block_carve(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, areas=None) -> np.ndarray:
@@ -326,18 +326,7 @@ def block_carve(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, areas=None
     terms = axis_terms(silhouettes.projections, [grid.centres(a) for a in range(3)])
     tables, starts = sum_areas(silhouettes) if areas is None else areas
     out = np.zeros(grid.shape, np.uint8)
-    _carve(
-        *terms,
-        rounding_bounds(terms),
-        silhouettes.sizes,
-        silhouettes.offsets,
-        silhouettes.pixels,
-        starts,
-        tables,
-        rule.table(),
-        _TOP,
-        _LEAF,
-        _TASKS,
-        out,
-    )
+    blocks = int(np.prod([-(-n // _TOP) for n in grid.shape]))
+    inputs = (silhouettes.sizes, silhouettes.offsets, silhouettes.pixels, starts, tables, rule.table())
+    spread(_carve, blocks, 4, *terms, rounding_bounds(terms), *inputs, out)
     return out.view(bool)

@@ -9,9 +9,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from visdom_plugin.threads import spread
 
 _ONES = np.uint64(0x0101010101010101)
+_GRAIN = 16
 
 
 class Pieces(NamedTuple):
@@ -29,10 +32,10 @@ class Pieces(NamedTuple):
     """(R,) piece of each run."""
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _count_runs(grid, counts):
-    nx, ny, nz = grid.shape
-    for x in prange(nx):
+@njit(cache=True, nogil=True)
+def _count_runs(begin, end, grid, counts):
+    _, ny, nz = grid.shape
+    for x in range(begin, end):
         for y in range(ny):
             runs = 0
             before = np.uint8(0)
@@ -43,10 +46,10 @@ def _count_runs(grid, counts):
             counts[x * ny + y] = runs
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _list_runs(grid, words, starts, begins, ends):
-    nx, ny, nz = grid.shape
-    for x in prange(nx):
+@njit(cache=True, nogil=True)
+def _list_runs(begin, end, grid, words, starts, begins, ends):
+    _, ny, nz = grid.shape
+    for x in range(begin, end):
         for y in range(ny):
             r = starts[x * ny + y]
             if r == starts[x * ny + y + 1]:
@@ -115,10 +118,10 @@ def _number(begins, ends, parents, labels, sizes):
     return count
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _erase(grid, starts, begins, ends, labels, keep):
-    nx, ny, _ = grid.shape
-    for x in prange(nx):
+@njit(cache=True, nogil=True)
+def _erase(begin, end, grid, starts, begins, ends, labels, keep):
+    ny = grid.shape[1]
+    for x in range(begin, end):
         for y in range(ny):
             for r in range(starts[x * ny + y], starts[x * ny + y + 1]):
                 if not keep[labels[r]]:
@@ -129,12 +132,12 @@ def find_pieces(occupancy: np.ndarray) -> Pieces:
     """Connected pieces of an (X, Y, Z) bool grid."""
     grid = occupancy.view(np.uint8)
     counts = np.zeros(grid.shape[0] * grid.shape[1], np.int64)
-    _count_runs(grid, counts)
+    spread(_count_runs, len(grid), _GRAIN, grid, counts)
     starts = np.concatenate([[0], np.cumsum(counts)])
     begins, ends = (np.empty(starts[-1], np.int32) for _ in range(2))
     aligned = grid.shape[2] % 8 == 0
     words = grid.view(np.uint64) if aligned else np.zeros((1, 1, 0), np.uint64)
-    _list_runs(grid, words, starts, begins, ends)
+    spread(_list_runs, len(grid), _GRAIN, grid, words, starts, begins, ends)
     parents = np.arange(starts[-1])
     _join(*grid.shape[:2], starts, begins, ends, parents)
     labels, sizes = np.empty(starts[-1], np.int32), np.zeros(starts[-1], np.int64)
@@ -144,12 +147,13 @@ def find_pieces(occupancy: np.ndarray) -> Pieces:
 
 def erase_pieces(occupancy: np.ndarray, pieces: Pieces, keep: np.ndarray) -> None:
     """Clears, in place, the pieces whose entry in `keep` (C,) bool is False."""
-    _erase(occupancy.view(np.uint8), pieces.column_starts, pieces.begins, pieces.ends, pieces.labels, keep)
+    inputs = (pieces.column_starts, pieces.begins, pieces.ends, pieces.labels, keep)
+    spread(_erase, len(occupancy), _GRAIN, occupancy.view(np.uint8), *inputs)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _look_up(voxels, ny, starts, begins, ends, labels, out):
-    for m in prange(len(voxels)):
+@njit(cache=True, nogil=True)
+def _look_up(begin, end, voxels, ny, starts, begins, ends, labels, out):
+    for m in range(begin, end):
         column, z = voxels[m, 0] * ny + voxels[m, 1], voxels[m, 2]
         out[m] = -1
         for r in range(starts[column], starts[column + 1]):
@@ -160,7 +164,8 @@ def _look_up(voxels, ny, starts, begins, ends, labels, out):
 def piece_of(voxels: np.ndarray, shape, pieces: Pieces) -> np.ndarray:
     """(M,) piece of each of some voxels (M, 3) int64 of a grid, -1 where there is none."""
     out = np.empty(len(voxels), np.int64)
-    _look_up(voxels, shape[1], pieces.column_starts, pieces.begins, pieces.ends, pieces.labels, out)
+    inputs = (shape[1], pieces.column_starts, pieces.begins, pieces.ends, pieces.labels)
+    spread(_look_up, len(voxels), 1 << 14, voxels, *inputs, out)
     return out
 
 

@@ -12,7 +12,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from visdom_plugin.threads import spread
 
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
@@ -126,10 +128,10 @@ def _next_cube(grid, i, j, k):
     return k
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _count_slabs(grid, counts, triangles_of, vertices_of):
-    nx, ny, nz = grid.shape
-    for i in prange(nx + 1):
+@njit(cache=True, nogil=True)
+def _count_slabs(begin, end, grid, counts, triangles_of, vertices_of):
+    _, ny, nz = grid.shape
+    for i in range(begin, end):
         triangles, vertices = 0, 0
         for j in range(ny + 1):
             k = 0
@@ -168,10 +170,12 @@ def _number_slab(grid, i, first, ids, vertices):
             k += 1
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _build(grid, chunks, table, counts, axes, offsets, first_triangle, first_vertex, vertices, faces):
+@njit(cache=True, nogil=True)
+def _build(
+    first, last, grid, chunks, table, counts, axes, offsets, first_triangle, first_vertex, vertices, faces
+):
     nx, ny, nz = grid.shape
-    for chunk in prange(chunks):
+    for chunk in range(first, last):
         begin, end = chunk * (nx + 1) // chunks, (chunk + 1) * (nx + 1) // chunks
         here = np.zeros((ny + 2, nz + 2, 3), np.int64)
         ahead = np.zeros((ny + 2, nz + 2, 3), np.int64)
@@ -214,23 +218,14 @@ def mesh_grid(occupancy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     table, counts = _cases()
     slabs = grid.shape[0] + 1
     triangles_of, vertices_of = np.zeros(slabs, np.int64), np.zeros(slabs, np.int64)
-    _count_slabs(grid, counts, triangles_of, vertices_of)
+    spread(_count_slabs, slabs, 16, grid, counts, triangles_of, vertices_of)
     vertices = np.empty((int(vertices_of.sum()), 3))
     faces = np.empty((int(triangles_of.sum()), 3), np.int64)
     first_triangle = np.concatenate([[0], np.cumsum(triangles_of)])
     first_vertex = np.concatenate([[0], np.cumsum(vertices_of)])
-    _build(
-        grid,
-        min(4, slabs),
-        table,
-        counts,
-        _EDGE_AXES,
-        _EDGE_OFFSETS,
-        first_triangle,
-        first_vertex,
-        vertices,
-        faces,
-    )
+    chunks = min(4, slabs)
+    inputs = (grid, chunks, table, counts, _EDGE_AXES, _EDGE_OFFSETS, first_triangle, first_vertex)
+    spread(_build, chunks, 1, *inputs, vertices, faces)
     return vertices, faces
 
 
