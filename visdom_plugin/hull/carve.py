@@ -77,14 +77,14 @@ def carve(domain: VisibleDomain, cameras: Cameras, masks: Sequence) -> Hull:
 
 
 def carve_silhouettes(
-    domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes, *, device="cpu"
+    domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes, *, device="cpu", effort: float = 1.0
 ) -> Hull | None:
-    """The hull, or None when nothing is left."""
+    """The hull, or None when nothing is left; `effort` as in `find_region`."""
     rule = keep_rule(domain, len(silhouettes))
     started = time.perf_counter()
     areas = sum_areas(silhouettes)
     summed = time.perf_counter()
-    placed = _place(domain, cameras, silhouettes, rule, areas)
+    placed = _place(domain, cameras, silhouettes, rule, areas, effort)
     if placed is None:
         return None
     grid, ball, closed = placed
@@ -152,14 +152,14 @@ def _carve_grid(
     return occupancy, pieces, keep
 
 
-def _place(domain: VisibleDomain, cameras, silhouettes, rule: KeepRule, areas):
+def _place(domain: VisibleDomain, cameras, silhouettes, rule: KeepRule, areas, effort: float):
     """Grid, ball (centre, radius) or None, and whether the views close the region; None for no region."""
     needs_ball = domain.kind == "unit-sphere"
     given = None if domain.bounds is None else np.array(domain.bounds, np.float64)
     ball_given = domain.sphere_centre is not None and domain.sphere_radius is not None
     region = None
     if given is None or (needs_ball and not ball_given):
-        region = _visible_region(domain, cameras, silhouettes, rule, areas)
+        region = _visible_region(domain, cameras, silhouettes, rule, areas, effort)
         if region is None:
             return None
     ball = None
@@ -202,10 +202,12 @@ def _say_dropped(sizes: np.ndarray, keep: np.ndarray, policy: str, min_fraction:
     return f"dropped {np.count_nonzero(~keep)}, {share:.2g} of the volume kept: {why}"
 
 
-def _visible_region(domain, cameras, silhouettes, rule: KeepRule, areas) -> Region | None:
+def _visible_region(domain, cameras, silhouettes, rule: KeepRule, areas, effort: float) -> Region | None:
     def find(rule: KeepRule) -> Region | None:
         fraction = 0.5 if domain.components == "largest" else domain.min_component_fraction
-        return find_region(cameras, silhouettes, rule, domain.components, fraction, areas=areas)
+        return find_region(
+            cameras, silhouettes, rule, domain.components, fraction, areas=areas, effort=effort
+        )
 
     if domain.kind == "released-go" or (domain.kind == "visdom" and rule.least_visible > 1):
         return find(rule)

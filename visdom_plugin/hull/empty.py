@@ -18,6 +18,8 @@ from visdom_plugin.hull.votes import Silhouettes
 COMMAND = "visdom-hull DIR --diagnose"
 _CONVINCING = 0.9
 """Mean share of the masks that a trial hull must cover."""
+_EFFORT = 0.1
+"""Of the search for a trial hull's box: wrong suspicions leave many cells undecided and should fail soon."""
 
 
 def explain_empty(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes) -> EmptyHullError:
@@ -57,7 +59,7 @@ def _list(views: Sequence[int]) -> str:
 
 def _try(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes) -> float:
     """Mean share that a coarse hull covers of the masks of the views that see it, 0 without one."""
-    hull = carve_silhouettes(replace(domain, resolution=COARSE), cameras, silhouettes)
+    hull = carve_silhouettes(replace(domain, resolution=COARSE), cameras, silhouettes, effort=_EFFORT)
     if hull is None:
         return 0.0
     masks = [silhouettes.mask(i) for i in range(len(silhouettes))]
@@ -87,7 +89,7 @@ def _too_few_views(domain, cameras, silhouettes):
 def _beside(domain, cameras, silhouettes):
     if domain.bounds is not None:
         free = replace(domain, bounds=None)
-        hull = carve_silhouettes(replace(free, resolution=COARSE), cameras, silhouettes)
+        hull = carve_silhouettes(replace(free, resolution=COARSE), cameras, silhouettes, effort=_EFFORT)
         if hull is not None and _try(free, cameras, silhouettes) >= _CONVINCING:
             low, high = np.round(hull.extent, 4).tolist()
             return (

@@ -57,6 +57,7 @@ def find_region(
     drop_below: float = 0.0,
     *,
     areas=None,
+    effort: float = 1.0,
 ) -> Region | None:
     """The smallest box known to hold the rule's region, or None when no point can satisfy the rule.
 
@@ -68,6 +69,7 @@ def find_region(
         components: which pieces the box must hold: "all"; with "explain" those that explain foreground of their
             own; with any other policy those of not clearly less than `drop_below` of the largest's volume.
         areas: from `blocks.sum_areas`.
+        effort: share of the usual number of cells at which the search gives up.
     """
     areas = sum_areas(silhouettes) if areas is None else areas
     centre = look_at_point(cameras.to("cpu", dtype=_double())).numpy()
@@ -77,7 +79,7 @@ def find_region(
     for doubling in range(_DOUBLINGS + 1):
         half = 2.0 * reach * 2**doubling
         start = Grid(centre - half, 2 * half / _START, (_START,) * 3)
-        found = _refine(silhouettes, areas, rule, start, components, drop_below)
+        found = _refine(silhouettes, areas, rule, start, components, drop_below, effort)
         if found is None:
             continue
         box, touches = found
@@ -102,7 +104,9 @@ def _tensor(array):
     return torch.from_numpy(array)
 
 
-def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, components: str, drop_below: float):
+def _refine(
+    silhouettes, areas, rule: KeepRule, grid: Grid, components: str, drop_below: float, effort: float
+):
     """Box of the region inside one cube and whether it touches the cube's faces, or None."""
     cells = np.stack(np.unravel_index(np.arange(np.prod(grid.shape)), grid.shape), -1)
     settled = np.zeros((0, 3), np.int64)
@@ -117,7 +121,7 @@ def _refine(silhouettes, areas, rule: KeepRule, grid: Grid, components: str, dro
             stays = _staying(silhouettes, areas, rule, grid, cells, inside, components, drop_below)
             whole = int(stays[:whole].sum())
             cells, inside = cells[stays], inside[stays]
-        most = _MOST_CELLS if inside.any() else _MOST_EMPTY
+        most = effort * (_MOST_CELLS if inside.any() else _MOST_EMPTY)
         last = grid.shape[0] >= _MOST_SIDE or 8 * (len(cells) - whole) > most
         # Corners of several frusta stay undecided in cells of any size.
         if len(cells) == 0 or (last and not inside.any()):
