@@ -16,22 +16,27 @@ from visdom_plugin.registry import Preset
 FULL = ZipNerfConfig()
 
 QUICK = ZipNerfConfig(
-    steps=600,
+    steps=500,
     rays=512,
+    # The object, all there is to see, lies between the cameras.
+    far=3.0,
     samples=(32, 32, 16),
+    test_samples=(32, 24, 12),
     coarse_grid=HashLayout(4, 1, base_resolution=16, max_resolution=128, log2_table_size=15),
     fine_grid=HashLayout(5, 1, base_resolution=16, max_resolution=256, log2_table_size=15),
-    grid=HashLayout(7, 4, base_resolution=16, max_resolution=1024, log2_table_size=15),
+    grid=HashLayout(6, 4, base_resolution=16, max_resolution=512, log2_table_size=15),
     hidden=32,
     bottleneck=31,
     colour_hidden=32,
     colour_layers=2,
+    view_degree=1,
+    density_bias=-6.0,
     lr=0.01,
     lr_final=0.001,
-    lr_warm_up=60,
+    lr_warm_up=50,
 )
 
-MASK = {"mask_weight": 0.1}
+MASK = {"mask_weight": 0.1, "background": "random"}
 VD = MASK | {"hull": VisibleDomain(dilate_px=1), "vd": SamplerConfig(enabled=True), "samples": (16, 16, 12)}
 
 

@@ -12,14 +12,14 @@ class SamplerConfig:
 
     enabled: bool = False
     """Whether the hook takes part at all; off leaves the base method unchanged."""
-    epsilon_camera_distances: float | None = 0.2
+    epsilon_camera_distances: float | None = 0.03
     """Half width of the band, in mean distances from the training cameras to the hull's centre (the paper's 0.2
     for cameras at distance 1)."""
     epsilon_hull_radii: float | None = None
     """The same in radii of the hull; wins over camera distances."""
     epsilon_world: float | None = None
     """The same in units of the scene; wins over both."""
-    interval: Literal["first_hit", "entry_exit"] = "first_hit"
+    interval: Literal["first_hit", "entry_exit"] = "entry_exit"
     """Around the first hit, as the paper writes, or from before the first to behind the last."""
     missing: Literal["full", "skip"] = "full"
     """Rays that miss the hull: sampled over the method's full range, or not at all."""

@@ -50,7 +50,7 @@ class VisDomSampler:
         *,
         epsilon_hull_radii: float | None = None,
         epsilon_world: float | None = None,
-        interval: Literal["first_hit", "entry_exit"] = "first_hit",
+        interval: Literal["first_hit", "entry_exit"] = "entry_exit",
         missing: Literal["full", "skip"] = "full",
     ):
         if epsilon_hull_radii is not None and epsilon_world is not None:

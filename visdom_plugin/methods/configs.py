@@ -104,6 +104,8 @@ class IngpConfig:
     """Width of both networks' hidden layers: one for density, two for colour."""
     geometry_features: int = 15
     """Numbers handed from the density network to the colour network."""
+    view_degree: int = 4
+    """Spherical harmonics of the viewing direction that colours may depend on: degree^2 numbers, 0 none."""
     density_bias: float = -1.0
     """density = exp(x + bias), per camera distance."""
 
@@ -115,6 +117,8 @@ class IngpConfig:
     occupancy_fraction: float = 0.25
     occupancy_alpha: float = 0.01
     """Cells whose density gives less opacity than this over one step length are skipped."""
+    drop_unsampled: bool = True
+    """Cells that no training ray samples, given its bounds, stay empty for ever (Instant-NGP: that none sees)."""
 
     mask_weight: float = 0.0
     """lambda_1, binary cross entropy between rendered opacity and mask."""
@@ -173,6 +177,8 @@ class ZipNerfConfig:
     colour_hidden: int = 256
     colour_layers: int = 3
     """Hidden layers of the colour network; its input joins again before the last of them."""
+    view_degree: int = 4
+    """Octaves of sines of the viewing direction that colours may depend on."""
     density_bias: float = -1.0
     """density = exp(x + bias), per camera distance."""
 

@@ -20,6 +20,7 @@ from visdom_plugin.methods.radiance import (
     photograph_on,
     render_image,
     silhouette_loss,
+    spread_rays,
 )
 from visdom_plugin.nerf.directions import encode_harmonics
 from visdom_plugin.nerf.fields import perceptron, truncated_exp
@@ -55,7 +56,9 @@ class Ingp:
         draw = generator(seed, "field")
         self.table = torch.nn.Parameter(initial_table(c.grid, draw).to(device))
         self.density_net = perceptron([c.grid.width, c.hidden, 1 + c.geometry_features], draw).to(device)
-        self.colour_net = perceptron([16 + c.geometry_features, c.hidden, c.hidden, 3], draw).to(device)
+        self.colour_net = perceptron(
+            [c.view_degree**2 + c.geometry_features, c.hidden, c.hidden, 3], draw
+        ).to(device)
         nets = {f"density_net.{k}": p for k, p in self.density_net.named_parameters()}
         nets |= {f"colour_net.{k}": p for k, p in self.colour_net.named_parameters()}
         self.optimiser = FieldOptimiser(
@@ -64,6 +67,12 @@ class Ingp:
         self.occupancy = OccupancyGrid(
             c.occupancy_resolution, c.half_side, c.occupancy_alpha / c.step_length, device=device
         )
+        if c.drop_unsampled:
+            parts = [
+                self._bound(*spread_rays(views.cameras[i].to(device)), self.hooks) for i in range(len(views))
+            ]
+            rays = LocalRays(*(torch.cat(x) for x in zip(*parts, strict=True)))
+            self.occupancy.restrict(rays.origins, rays.directions, rays.near, rays.far)
         self._rays = LEAST_RAYS
         self.metrics: dict[str, float] = {}
 
@@ -152,14 +161,17 @@ class Ingp:
         return self._look(features, directions.to(self.device))
 
     def _look(self, features: Tensor, directions: Tensor) -> Tensor:
-        return self.colour_net(torch.cat([features, encode_harmonics(directions)], -1)).sigmoid()
+        return self.colour_net(torch.cat([features, self._encode_views(directions)], -1)).sigmoid()
+
+    def _encode_views(self, directions: Tensor) -> Tensor:
+        return encode_harmonics(directions)[..., : self.config.view_degree**2]
 
     def _shade(self, rays: LocalRays, samples: PackedSamples, background: Tensor):
         middles = (samples.starts + samples.ends) / 2
         points = rays.origins[samples.ray] + middles[:, None] * rays.directions[samples.ray]
         density, features = self._features(points)
         # Harmonics once per ray, then spread to its samples.
-        views = encode_harmonics(rays.directions)[samples.ray]
+        views = self._encode_views(rays.directions)[samples.ray]
         colours = self.colour_net(torch.cat([features, views], -1)).sigmoid()
         rgb, alpha, depth, _ = composite_packed(
             density, colours, samples.starts, samples.ends, samples.ray_offsets, background

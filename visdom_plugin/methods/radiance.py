@@ -58,6 +58,18 @@ def bound_rays(
     return LocalRays(frame.to_local(origins), directions.float(), near.float(), far.float(), hit)
 
 
+def spread_rays(camera: Cameras, most: int = 256) -> tuple[Tensor, Tensor]:
+    """Origins and directions (n, 3) of a camera's pixels, at most `most` evenly chosen along each side."""
+    height, width = int(camera.height), int(camera.width)
+    device = camera.intrinsics.device
+    v, u = (
+        torch.linspace(0.5, size - 0.5, min(size, most), dtype=torch.float64, device=device)
+        for size in (height, width)
+    )
+    grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2)
+    return rays_of(camera.to(dtype=torch.float64), grid)
+
+
 def photograph_on(background: Tensor, batch: Any, alpha: Tensor) -> Tensor:
     """What a batch of pixels should look like on `background` (n, 3); see `losses.composite`."""
     return composite(batch.rgb, batch.mask, background, alpha=alpha, mask_known=batch.mask_known)
@@ -105,9 +117,9 @@ def mesh_density(
     resolution: int = 160,
     chunk: int = 1 << 17,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """The surface where a voxel is half opaque, by marching cubes, in the world frame.
+    """The surface where the field is half opaque over a thirtieth of the object, by marching cubes, world frame.
 
-    A coarse look at the whole cube finds the box to look at closely.
+    Whatever the resolution, the level is the same. A coarse look at the whole cube finds the object's box.
 
     Args:
         density_of: points (m, 3) in the field's frame to density (m,) per unit of that frame.
@@ -130,16 +142,17 @@ def mesh_density(
 
     coarse = 64
     step = 2 * half_side / coarse
-    # exp(-density * step) = 1/2; coarse cells may hold thin parts, so less is asked of them.
+    # exp(-density * length) = 1/2; coarse cells may hold thin parts, so less is asked of them.
     opaque = np.argwhere(sample(np.full(3, -half_side), step, (coarse,) * 3) > 0.25 * math.log(2) / step)
     if not len(opaque):
         return None
     lower = -half_side + step * (opaque.min(0) - 1)
     upper = -half_side + step * (opaque.max(0) + 2)
-    step = float((upper - lower).max()) / resolution
+    extent = float((upper - lower).max())
+    step = extent / resolution
     shape = np.ceil((upper - lower) / step).astype(int)
     values = np.pad(sample(lower, step, shape), 1)
-    level = math.log(2) / step
+    level = math.log(2) / (extent / 30)
     if not values.max() > level:
         return None
     # The logarithm of an exponential field is close to linear between voxels.

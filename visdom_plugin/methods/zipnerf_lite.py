@@ -40,6 +40,9 @@ RAYS_AT_ONCE = 1 << 12
 CHARBONNIER = 0.001  # Zip-NeRF
 RGB_PADDING = 0.001  # mip-NeRF
 INITIAL_FEATURE = 1e-4
+LEVELS = ("coarse", "fine", "field")
+INVISIBLE = 1 / 255
+"""Opacity of a whole ray: one step of an 8-bit image."""
 
 
 class AntialiasedGrid(nn.Module):
@@ -117,7 +120,9 @@ class ZipNerfLite:
                 "coarse": AntialiasedGrid(c.coarse_grid, c.hidden, 1, draw),
                 "fine": AntialiasedGrid(c.fine_grid, c.hidden, 1, draw),
                 "field": AntialiasedGrid(c.grid, c.hidden, 1 + c.bottleneck, draw),
-                "colour": ColourNet(c.bottleneck + 27, c.colour_hidden, c.colour_layers, draw),
+                "colour": ColourNet(
+                    c.bottleneck + 3 + 6 * c.view_degree, c.colour_hidden, c.colour_layers, draw
+                ),
             }
         ).to(device)
         named = dict(self.model.named_parameters())
@@ -157,7 +162,7 @@ class ZipNerfLite:
             loss = distortion_loss(curve_distances(last.t), last.weights).mean()
             losses["distortion"] = c.distortion_weight * loss
         if c.hash_decay:
-            grids = (self.model[name].decay() for name in ("coarse", "fine", "field"))
+            grids = (self.model[name].decay() for name in LEVELS)
             losses["hash_decay"] = c.hash_decay * sum(grids)
         return losses
 
@@ -178,10 +183,7 @@ class ZipNerfLite:
 
         def render_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             rays = self._bound(origins, directions, hooks)
-            levels, colours = self._see(rays, radius, c.test_samples or c.samples, 1.0, None)
-            last = levels[-1]
-            weights = torch.where(rays.hit[:, None], last.weights, 0)
-            return composite(weights, colours, last.t, background)
+            return self._render_rays(rays, radius, background)
 
         return render_image(camera.to(self.device), render_rays, self.frame, RAYS_AT_ONCE)
 
@@ -201,26 +203,56 @@ class ZipNerfLite:
         return bound_rays(origins, directions, near, far, self.frame, hooks)
 
     def _see(self, rays: LocalRays, radius, counts: Sequence[int], progress: float, draw):
-        """All levels along rays, and the field's colours (n, S, 3). With a generator, samples are jittered."""
-        n = len(rays.near)
-        near, far = rays.near[:, None], rays.far[:, None]
-        s = near.new_tensor([0.0, 1.0]).expand(n, 2).contiguous()
-        weights = torch.ones_like(near)
+        """All levels along rays, and the field's colours (n, S, 3). Samples are jittered by the generator."""
+        level = None
         levels = []
-        for name, count in zip(("coarse", "fine", "field"), counts, strict=True):
-            jitter = None if draw is None else torch.rand(n, 1, generator=draw).to(self.device)
-            s = sample_edges(s, anneal(weights.detach(), progress, self.config.anneal_slope), count, jitter)
-            t = distances_of(s, near, far)
-            turn = None if draw is None else torch.rand(n, count, generator=draw).to(self.device)
-            points, std = multisample(rays.origins, rays.directions, t, radius, turn)
-            out = self.model[name](points, std)
-            density = truncated_exp(out[..., 0] + self.config.density_bias)
-            weights, _ = weights_from_density(density, t)
-            levels.append(Level(s, t, weights))
+        for name, count in zip(LEVELS, counts, strict=True):
+            level, out = self._look(name, rays, radius, level, count, progress, draw)
+            levels.append(level)
         return levels, self._shade(out[..., 1:], rays.directions[:, None])
 
+    def _look(
+        self, name: str, rays: LocalRays, radius, before: Level | None, count: int, progress: float, draw
+    ):
+        """One level, sampled where the level before saw something, and its network's outputs (n, S, ...)."""
+        n = len(rays.near)
+        near, far = rays.near[:, None], rays.far[:, None]
+        if before is None:
+            s, weights = near.new_tensor([0.0, 1.0]).expand(n, 2).contiguous(), torch.ones_like(near)
+        else:
+            s, weights = before.s, before.weights.detach()
+        jitter = None if draw is None else torch.rand(n, 1, generator=draw).to(self.device)
+        s = sample_edges(s, anneal(weights, progress, self.config.anneal_slope), count, jitter)
+        t = distances_of(s, near, far)
+        turn = None if draw is None else torch.rand(n, count, generator=draw).to(self.device)
+        points, std = multisample(rays.origins, rays.directions, t, radius, turn)
+        out = self.model[name](points, std)
+        density = truncated_exp(out[..., 0] + self.config.density_bias)
+        return Level(s, t, weights_from_density(density, t)[0]), out
+
+    def _render_rays(self, rays: LocalRays, radius: Tensor, background: Tensor):
+        """Colour, opacity and depth of rays, level by level for those that still may show something."""
+        counts = self.config.test_samples or self.config.samples
+        n = len(rays.near)
+        rgb, alpha, depth = background.expand(n, 3).clone(), torch.zeros_like(rays.near), rays.far.clone()
+        left, level = rays.hit.nonzero()[:, 0], None
+        rays = LocalRays(*(x[left] for x in rays))
+        for name, count in zip(LEVELS, counts, strict=True):
+            if not len(left):
+                return rgb, alpha, depth
+            level, out = self._look(name, rays, radius, level, count, 1.0, None)
+            # Proposals bound the field's weights from above: where they see nothing, it does not either.
+            seen = (level.weights.sum(-1) > INVISIBLE).nonzero()[:, 0]
+            left, out, level = left[seen], out[seen], Level(*(x[seen] for x in level))
+            rays = LocalRays(*(x[seen] for x in rays))
+        if len(left):
+            colours = self._shade(out[..., 1:], rays.directions[:, None])
+            rgb[left], alpha[left], depth[left] = composite(level.weights, colours, level.t, background)
+        return rgb, alpha, depth
+
     def _shade(self, bottleneck: Tensor, directions: Tensor) -> Tensor:
-        view = encode_sinusoids(directions).expand(*bottleneck.shape[:-1], 27)
+        view = encode_sinusoids(directions, self.config.view_degree)
+        view = view.expand(*bottleneck.shape[:-1], view.shape[-1])
         return self.model["colour"](torch.cat([bottleneck, view], -1))
 
     def _field(self, points: Tensor) -> Tensor:

@@ -47,7 +47,8 @@ class OccupancyGrid:
         self.resolution, self.half_side = resolution, half_side
         self.threshold, self.decay = threshold, decay
         self.density = torch.zeros(resolution**3, device=device)
-        self.occupied = torch.ones(resolution, resolution, resolution, dtype=torch.bool, device=device)
+        self.reachable = torch.ones(resolution, resolution, resolution, dtype=torch.bool, device=device)
+        self.occupied = self.reachable.clone()
 
     @torch.no_grad()
     def update(
@@ -87,7 +88,25 @@ class OccupancyGrid:
         # The same cell may be drawn twice: the larger density counts, whatever the order.
         self.density.scatter_reduce_(0, cells, found, "amax")
         limit = min(self.threshold, float(self.density.double().mean()))
-        self.occupied = (self.density > limit).reshape(self.occupied.shape)
+        self.occupied = (self.density > limit).reshape(self.occupied.shape) & self.reachable
+
+    def restrict(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> None:
+        """Gives up all cells that no training ray samples, but for neighbours of those that one does.
+
+        What no ray ever samples is never trained: whatever the field says there is made up. Instant-NGP gives
+        up cells that no training camera sees, for the same reason.
+
+        Args:
+            origins, directions: (n, 3) float32, the training rays or an even choice of them.
+            near, far: (n,) float32 their bounds.
+        """
+        grid = torch.zeros(self.reachable.shape, dtype=torch.bool)
+        rays = [x.detach().float().cpu().contiguous().numpy() for x in (origins, directions, near, far)]
+        half_cell = np.float32(self.half_side / self.resolution)
+        _touch(*rays, half_cell, grid.numpy(), np.float32(self.half_side))
+        grown = torch.nn.functional.max_pool3d(grid[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
+        self.reachable = grown.to(self.reachable.device)
+        self.occupied = self.occupied & self.reachable
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"density": self.density, "occupied": self.occupied.to(torch.uint8)}
@@ -152,6 +171,21 @@ def _walk(r, origins, directions, near, far, step, shift, occupied, half_side, s
             found += 1
         i += 1
     return found
+
+
+@njit(cache=True, nogil=True)
+def _touch(origins, directions, near, far, step, touched, half_side):
+    n = touched.shape[0]
+    scale = n / (2 * half_side)
+    for r in range(len(origins)):
+        t = near[r]
+        while t < far[r]:
+            x = int((origins[r, 0] + t * directions[r, 0] + half_side) * scale)
+            y = int((origins[r, 1] + t * directions[r, 1] + half_side) * scale)
+            z = int((origins[r, 2] + t * directions[r, 2] + half_side) * scale)
+            if 0 <= x < n and 0 <= y < n and 0 <= z < n:
+                touched[x, y, z] = True
+            t += step
 
 
 def march(
