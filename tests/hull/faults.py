@@ -40,6 +40,27 @@ class Fault(NamedTuple):
     """The views that must be named; empty when the fault is of the whole capture."""
 
 
+class Verdict(NamedTuple):
+    """How a check did on a planted fault."""
+
+    mark: str
+    """ "+" found and named alone, "~" found among several suspects or causes, "missed"."""
+    sure: str
+    beside: int
+    """Findings that are not about the planted fault."""
+
+
+def judge(fault: Fault, found) -> Verdict:
+    """Compares a planted fault with what `check` found."""
+    for finding in found.findings:
+        if finding.kind == fault.kind and set(fault.views) <= set(finding.views):
+            alone = set(fault.views) == set(finding.views) and "; or " not in finding.what
+            return Verdict("+" if alone else "~", finding.sure, len(found.findings) - 1)
+        if f"{fault.kind}" in finding.alternatives:
+            return Verdict("~", finding.sure, len(found.findings) - 1)
+    return Verdict("missed", "", len(found.findings))
+
+
 def capture_of(views) -> Capture:
     """A capture from anything with cameras, images, masks and names."""
     return Capture(views.cameras, tuple(views.images), tuple(views.masks), tuple(views.names))
@@ -228,6 +249,14 @@ def shifted_mask(c: Capture, v: int) -> Fault:
 def mirrored_mask(c: Capture, v: int) -> Fault:
     """One mask mirrored left to right."""
     return Fault(_mask(c, v, lambda m: m.flip(1)), "view", (v,))
+
+
+def clustered(c: Capture, v: int, count: int = 3) -> Fault:
+    """Only the views of a dense capture that look most nearly from the side that one does."""
+    lines = torch.nn.functional.normalize(c.cameras.centres - look_at_point(c.cameras), dim=-1)
+    near = (lines @ lines[v]).argsort(descending=True)[:count]
+    images, masks, names = (tuple(items[i] for i in near.tolist()) for items in (c.images, c.masks, c.names))
+    return Fault(Capture(c.cameras[near], images, masks, names), "clustered", ())
 
 
 FAULTS: dict[str, Callable[[Capture, int], Fault]] = {

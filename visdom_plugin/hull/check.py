@@ -18,9 +18,10 @@ from visdom_plugin.hull.maskfaults import check_border, check_content, check_siz
 from visdom_plugin.hull.suspects import QUIET_PX, Suspicion, explain
 from visdom_plugin.hull.votes import gather_silhouettes
 
-CLUSTERED_DEGREES = 45.0
-"""Views within this angle leave a hull more than 2.4 times as deep as the object."""
+CLUSTERED_DEGREES = 60.0
+"""Views within this angle leave a hull more than 1.7 times as deep as the object."""
 _DISAGREE_PX, _SPEAKING_PX = 0.1, 0.5
+_RAYS, _BRIEF_VIEWS = 1024, 16
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def check(
         images: N tensors or arrays (H, W, 3), or empty to leave them out.
         names: the views' names, for the sentences.
         k: the K that is going to be used; by default it is to be advised.
-        brief: a fraction of a second; names a fault but not always its cause.
+        brief: a fraction of a second; names a fault but not always its cause, and compares 16 views at most.
     """
     masks = [np.asarray(m.detach().cpu() if hasattr(m, "detach") else m).astype(bool) for m in masks]
     names = Name([f"view {i}" for i in range(len(masks))] if names is None else names)
@@ -72,12 +73,14 @@ def check(
     out |= {i for i, m in enumerate(masks) if not m.any()}
     usable = np.array([i for i in range(len(masks)) if i not in out], np.int64)
     repeated = _repeated(masks, images, out, names)
+    if brief and len(usable) > _BRIEF_VIEWS:
+        usable = usable[np.arange(_BRIEF_VIEWS) * len(usable) // _BRIEF_VIEWS]
     if len(usable) < 2:
         notes, found = _split([*found, *repeated])
         return Check(found, notes, None, None, tuple(usable.tolist()))
     chosen = cameras[torch.from_numpy(usable)]
     outlines = draw_outlines(chosen, gather_silhouettes(chosen, [masks[i] for i in usable]))
-    inverted, outlines, fit = _inverted(outlines, masks, usable, names)
+    inverted, outlines = _inverted(outlines, masks, usable, names)
     found += inverted
     turned = {v for f in inverted for v in f.views}
     found += check_border([m if i not in turned else ~m for i, m in enumerate(masks)], names)
@@ -124,16 +127,17 @@ def _repeated(masks, images, out: set[int], names: Name) -> list[Finding]:
 
 def _inverted(outlines: Outlines, masks, usable: np.ndarray, names: Name):
     """Masks that hold the border of their image, and fit the others no worse when turned over."""
-    fit = measure_coherence(outlines, 64)
     flagged = [k for k, i in enumerate(usable) if look_inverted(masks[i])]
     if not flagged:
-        return [], outlines, fit
+        return [], outlines
+    rays = max(_RAYS // len(usable), 16)
+    fit = measure_coherence(outlines, rays)
     fields = tuple(-f if k in flagged else f for k, f in enumerate(outlines.fields))
     turned = replace(outlines, fields=fields)
-    after = measure_coherence(turned, 64)
+    after = measure_coherence(turned, rays)
     # A close-up fills its border as well, but it fits as it is and not when turned over.
     if fit.score <= QUIET_PX and after.score > 10 * QUIET_PX:
-        return [], outlines, fit
+        return [], outlines
     views = tuple(int(usable[k]) for k in flagged)
     sound = after.score <= _DISAGREE_PX and after.power > max(_SPEAKING_PX, fit.power)
     whose = "all masks are" if len(views) == len(masks) else f"the mask of {names[views[0]]} is"
@@ -149,7 +153,7 @@ def _inverted(outlines: Outlines, masks, usable: np.ndarray, names: Name):
         after.score / OBJECT_PX,
         "invert them: white (True) on the object",
     )
-    return [said], turned, after
+    return [said], turned
 
 
 def _join(repeated: list[Finding], causes: list[Suspicion], usable, names: Name):
@@ -211,7 +215,8 @@ def _cause(cause: Suspicion, usable: np.ndarray, names: Name, fit: Coherence) ->
     ratio = cause.after / cause.before
     sure = "certain" if cause.before > _DISAGREE_PX and ratio < 0.1 else "likely"
     sure = "possible" if cause.rivals or cause.others else sure
-    return Finding(cause.kind, f"{what}: {gain}", views, sure, 1 - ratio, _TODO[cause.kind])
+    alternatives = tuple(sorted({kind for kind, _, _ in cause.others}))
+    return Finding(cause.kind, f"{what}: {gain}", views, sure, 1 - ratio, _TODO[cause.kind], alternatives)
 
 
 def _disagreement(fit: Coherence, views: np.ndarray, names: Name) -> Finding:
@@ -262,7 +267,7 @@ def _clustered(outlines: Outlines, fit: Coherence, cameras: Cameras) -> list[Fin
             f"all views look from within {spread.degrees:.0f} degrees of each other (opposite sides count as "
             f"one): the hull may be {spread.stretch:.1f} times as deep as the object",
             (),
-            "certain" if spread.degrees < CLUSTERED_DEGREES / 2 else "likely",
+            "certain" if spread.degrees < 0.67 * CLUSTERED_DEGREES else "likely",
             spread.degrees,
             "add views from the sides; the visible domain gains little from views of similar directions",
         )

@@ -80,8 +80,8 @@ class Residuals(NamedTuple):
     """(R,) pixels, against all other views; at most CAP_PX."""
     without: np.ndarray
     """(R, N) pixels, with one of the other views left out."""
-    points: np.ndarray
-    """(R, 3) the best point of each ray, world frame."""
+    ends: np.ndarray
+    """(R, 2, 3) first and last of the best points of each ray, world frame; only when no ball was given."""
     counts: np.ndarray
     """(R,) bool: False where a part of the ray near the object is seen by no other view, so that nothing can
     be said."""
@@ -147,7 +147,7 @@ def _cut(c0, c1, low, high):
 @njit(cache=True, nogil=True)
 def _march(
     begin, end, view, uv, motions, centres, intrinsics, projections, sizes, offsets, fields,
-    least, near, far, ball, radius, step, whole, without, points, counts,
+    least, near, far, ball, radius, step, whole, without, ends, counts,
 ):  # fmt: skip
     views = len(sizes)
     start, slope, rate = np.empty((views, 3)), np.empty((views, 3)), np.empty(views)
@@ -185,9 +185,10 @@ def _march(
             off = 0.0
             for c in range(3):
                 off += (o[c] + along * d[c] - ball[c]) ** 2
-            half = np.sqrt(max(radius * radius - off, 0.0))
+            # What few views see was left out when the ball was placed and may lie beside it.
+            half = max(np.sqrt(max(radius * radius - off, 0.0)), 0.75 * radius)
             low, high = max(along - half, near), along + half
-        best, best_at = CAP_PX, low if low < np.inf else 0.0
+        best, begin_t, end_t = CAP_PX, 0.0, 0.0
         for j in range(views):
             without[r, j] = CAP_PX
         t = low
@@ -220,23 +221,29 @@ def _march(
                     first, second, worst = value, first, j
                 elif value > second:
                     second = value
+                if second > CAP_PX:
+                    # Two views rule the point out, whatever the others say.
+                    break
             if seen >= least:
-                if first < best:
-                    best, best_at = first, t
+                if first < best - 0.5:
+                    begin_t, end_t = t, t
+                elif first <= best + 0.5:
+                    end_t = t
+                best = min(best, first)
                 if worst >= 0 and second < without[r, worst]:
                     without[r, worst] = second
-                if best <= _HIT_PX:
+                if best <= _HIT_PX and radius > 0:
                     break
             elif radius > 0 and seen == 0:
                 counts[r] = False
             # Fields change by at most one pixel per pixel, so what is far above the cap may be skipped.
-            skip = min(max(second - CAP_PX, 1.0), 4.0)
+            skip = min(max(second - CAP_PX, 1.0), 8.0)
             t += step * skip / speed if speed * unseen > step * skip else unseen
         whole[r] = best
         for j in range(views):
             without[r, j] = min(without[r, j], best)
         for c in range(3):
-            points[r, c] = o[c] + best_at * d[c]
+            ends[r, 0, c], ends[r, 1, c] = o[c] + begin_t * d[c], o[c] + end_t * d[c]
 
 
 def choose_pixels(
@@ -279,7 +286,7 @@ def march_rays(
         view: (R,) the view of each ray.
         uv: (R, 2) its pixel, in the fields' pixels.
         least: a point counts when at least this many other views see it.
-        ball: (centre, radius) to stay in; by default rays are followed as far as any other view sees them.
+        ball: (centre, radius) to stay near; by default rays are followed as far as any other view sees them.
         step_px: how far the fastest projection moves between two points.
     """
     count, views = len(view), len(outlines)
@@ -293,13 +300,13 @@ def march_rays(
         (np.zeros(3), -1.0) if ball is None else (np.asarray(ball[0], np.float64), float(ball[1]))
     )
     whole, without = np.empty(count), np.empty((count, views))
-    points, counts = np.empty((count, 3)), np.ones(count, np.bool_)
+    ends, counts = np.empty((count, 2, 3)), np.ones(count, np.bool_)
     spread(
         _march, count, 64, view, uv, outlines.rotations, outlines.centres, outlines.intrinsics,
         outlines.projections, sizes, offsets, fields, least, near, far, centre, radius, step_px,
-        whole, without, points, counts,
+        whole, without, ends, counts,
     )  # fmt: skip
-    return Residuals(view, whole, without, points, counts)
+    return Residuals(view, whole, without, ends, counts)
 
 
 TOLERANCE_PX = 2.0
@@ -342,21 +349,25 @@ class Coherence(NamedTuple):
         return _mean(np.delete(self.beside_without[:, view], view), 0.0)
 
 
-def measure_coherence(outlines: Outlines, per_view: int = 256, step_px: float = 1.0) -> Coherence:
+def measure_coherence(
+    outlines: Outlines, per_view: int = 256, step_px: float = 1.0, *, power: bool = True
+) -> Coherence:
     """Marches rays of every mask: first wherever three views see, then round the place found.
 
     Args:
         per_view: rays of each mask, and half as many beside it.
+        power: False leaves out the rays beside the masks.
     """
     views = len(outlines)
     view, uv = choose_pixels(outlines, per_view)
-    found = march_rays(outlines, view, uv, least=min(2, views - 1), step_px=step_px)
+    found = march_rays(outlines, view, uv, least=min(2, views - 1), step_px=2 * step_px)
     ball = _place(found)
     beside = None
     if ball is not None:
         found = march_rays(outlines, view, uv, least=1, ball=ball, step_px=step_px)
-        around = choose_pixels(outlines, max(per_view // 2, 8), beside=True)
-        beside = march_rays(outlines, *around, least=1, ball=ball, step_px=step_px)
+        if power:
+            around = choose_pixels(outlines, max(per_view // 2, 8), beside=True)
+            beside = march_rays(outlines, *around, least=1, ball=ball, step_px=step_px)
     contradicted = np.full(views, np.nan)
     for i in range(views):
         mine = _counted(found, i)
@@ -395,7 +406,8 @@ def _place(found: Residuals) -> tuple[np.ndarray, float] | None:
     close = found.whole < 0.5 * CAP_PX
     if close.sum() < 8:
         return None
-    points = found.points[close]
-    centre = np.median(points, 0)
-    away = np.linalg.norm(points - centre, axis=1)
-    return centre, 1.5 * float(np.quantile(away, 0.9))
+    ends = found.ends[close]
+    centre = np.median(ends.mean(1), 0)
+    middles, reach = (np.linalg.norm(p - centre, axis=-1) for p in (ends.mean(1), ends))
+    # Views from similar directions leave the depth open: then the ends lie much farther out than the middles.
+    return centre, max(1.5 * float(np.quantile(middles, 0.9)), float(np.quantile(reach.max(1), 0.9)))

@@ -14,7 +14,7 @@ USUAL_K = 3
 LOST = 0.02
 """A K may leave this share of a mask's rays without support beyond what K = 1 leaves."""
 _TOLERANCE_PX = 1.0
-_RAYS = 256
+_RAYS, _MOST_RAYS = 256, 4608
 
 
 class Advice(NamedTuple):
@@ -39,10 +39,11 @@ def advise_k(
     most = min(wanted, len(outlines))
     if len(outlines) < 2:
         return Advice(1, {1: np.ones(len(outlines))}, "there is only one view")
-    fit = measure_coherence(outlines, _RAYS // 2) if fit is None else fit
+    rays = int(np.clip(_MOST_RAYS // len(outlines), 32, _RAYS))
+    fit = measure_coherence(outlines, rays, power=False) if fit is None else fit
     if fit.ball is None:
         return Advice(most, {}, "the masks agree nowhere, so nothing can be said of K")
-    view, uv = choose_pixels(outlines, _RAYS)
+    view, uv = choose_pixels(outlines, rays)
     covered = {}
     for k in range(1, most + 1):
         found = march_rays(outlines, view, uv, least=k - 1, ball=fit.ball)

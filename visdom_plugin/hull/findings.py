@@ -23,6 +23,8 @@ class Finding(NamedTuple):
     """The number behind `sure`; what it measures is said in `what`."""
     todo: str
     """What to do about it."""
+    alternatives: tuple[str, ...] = ()
+    """Kinds of other causes that would explain it equally well."""
     note: bool = False
     """True for what is worth knowing but harms nothing: it does not make a capture faulty."""
 

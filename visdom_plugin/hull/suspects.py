@@ -22,7 +22,7 @@ of four to nine views stay below 0.03, most below 0.002."""
 _RATIO = 0.25
 _FLOOR_PX = 0.004
 _SCALES = (1 / 8, 1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4, 8)
-_MOST_RAYS, _TRIAL_RAYS = 1536, 512
+_MOST_RAYS, _TRIAL_RAYS, _BRIEF_RAYS = 1536, 512, 768
 _ALL_PAIRS = 9
 _MOST_ROUNDS = 3
 _POWER, _LEAST_POWER_PX, _TIE = 0.8, 0.5, 0.9
@@ -69,7 +69,7 @@ def explain(outlines: Outlines, *, brief: bool = False) -> tuple[list[Suspicion]
         something is wrong that no single cause explains, the last coherence's score stays high.
     """
     left, found = np.ones(len(outlines), bool), []
-    rays = int(np.clip((_TRIAL_RAYS if brief else _MOST_RAYS) // len(outlines), 24, 256))
+    rays = int(np.clip((_BRIEF_RAYS if brief else _MOST_RAYS) // len(outlines), 16, 256))
     fit = measure_coherence(outlines, rays)
     for _ in range(_MOST_ROUNDS):
         if fit.score <= QUIET_PX or left.sum() < 2:
@@ -96,14 +96,14 @@ def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool):
     """The cause that explains most, the changed outlines and the views that stay; (None, ...) for none."""
     count, before = len(outlines), fit.score
     enough = _RATIO * before
-    fewer = int(np.clip(_TRIAL_RAYS // count, 16, 64))
+    fewer = int(np.clip(_TRIAL_RAYS // count, 8, 64))
     alone = np.array([fit.score_without(i) for i in range(count)]) if count >= 3 else np.full(count, np.inf)
     culprit = int(np.argmin(alone))
     tried = []
     for trial in _whole_trials(count, alone, fit, brief):
         changed = trial.change(outlines)
         # Few rays do to rule a trial out.
-        if measure_coherence(changed, fewer, 2.0).score <= 2 * enough:
+        if measure_coherence(changed, fewer, 2.0, power=False).score <= 2 * enough:
             after = measure_coherence(changed, rays)
             if after.score <= enough:
                 tried.append((trial, changed, after))
