@@ -21,6 +21,7 @@ from visdom_plugin.methods.radiance import (
     render_image,
     silhouette_loss,
     spread_rays,
+    warm_up,
 )
 from visdom_plugin.nerf.directions import encode_harmonics
 from visdom_plugin.nerf.fields import perceptron, truncated_exp
@@ -73,8 +74,10 @@ class Ingp:
             ]
             rays = LocalRays(*(torch.cat(x) for x in zip(*parts, strict=True)))
             self.occupancy.restrict(rays.origins, rays.directions, rays.near, rays.far)
-        self._rays = LEAST_RAYS
         self.metrics: dict[str, float] = {}
+        if device.type == "cpu":
+            warm_up(self, views.cameras[0])
+        self._rays = LEAST_RAYS
 
     def pixels_per_step(self, step: int) -> int:
         """Pixels the next batch should have."""
@@ -139,7 +142,11 @@ class Ingp:
         self._rays = int(state["rays"])
 
     def export(self, folder: Path) -> list[Path]:
-        mesh = mesh_density(self._density, self._colour, self.frame, self.config.half_side)
+        def density_of(points: Tensor) -> Tensor:
+            # What rendering skips is not there.
+            return torch.where(self.occupancy.is_occupied(points.to(self.device)), self._density(points), 0)
+
+        mesh = mesh_density(density_of, self._colour, self.frame, self.config.half_side)
         return export_mesh(Path(folder) / "mesh.ply", mesh)
 
     def _bound(self, origins: Tensor, directions: Tensor, hooks: Sequence[SamplerHook]) -> LocalRays:

@@ -6,13 +6,14 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from visdom_plugin.cameras import Cameras, rays_of
+from visdom_plugin.cameras import Cameras, pixel_radius, rays_of
 from visdom_plugin.hooks.protocols import SamplerHook
 from visdom_plugin.losses import composite, mask_loss
 from visdom_plugin.nerf.frame import Frame
@@ -70,6 +71,23 @@ def spread_rays(camera: Cameras, most: int = 256) -> tuple[Tensor, Tensor]:
     return rays_of(camera.to(dtype=torch.float64), grid)
 
 
+def warm_up(method: Any, camera: Cameras) -> None:
+    """Compiles the CPU kernels of a step, or loads them, on 16 pixels; the gradients are dropped."""
+    log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
+    origins, directions = (x.float() for x in spread_rays(camera, 4))
+    n = len(origins)
+    batch = SimpleNamespace(
+        origins=origins,
+        directions=directions,
+        rgb=torch.rand(n, 3, generator=torch.Generator().manual_seed(0)),
+        mask=torch.ones(n),
+        radii=pixel_radius(camera).expand(n),
+        mask_known=None,
+    )
+    sum(method.train_step(batch, 1).values()).backward()
+    method.optimiser.adam.zero_grad(set_to_none=True)
+
+
 def photograph_on(background: Tensor, batch: Any, alpha: Tensor) -> Tensor:
     """What a batch of pixels should look like on `background` (n, 3); see `losses.composite`."""
     return composite(batch.rgb, batch.mask, background, alpha=alpha, mask_known=batch.mask_known)
@@ -115,6 +133,7 @@ def mesh_density(
     half_side: float,
     *,
     resolution: int = 160,
+    smallest_piece: float = 0.01,
     chunk: int = 1 << 17,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """The surface where the field is half opaque over a thirtieth of the object, by marching cubes, world frame.
@@ -126,12 +145,15 @@ def mesh_density(
         colour_of: points and viewing directions (m, 3) to rgb (m, 3) in [0, 1].
         half_side: of the cube around the frame's origin.
         resolution: voxels along the longest side of the box.
+        smallest_piece: pieces with fewer voxels than this share of the largest one are left out.
 
     Returns:
         vertices (V, 3) float64 world frame, faces (F, 3) int64 outward, and rgb (V, 3) uint8 as seen from
         outside along the normal; None where nothing is opaque.
     """
+    from scipy.ndimage import label
     from skimage.measure import marching_cubes
+    from trimesh import Trimesh
 
     def sample(lower: np.ndarray, step: float, shape: Sequence[int]) -> np.ndarray:
         axes = [torch.from_numpy(lower[a] + step * (np.arange(shape[a]) + 0.5)).float() for a in range(3)]
@@ -140,28 +162,35 @@ def mesh_density(
             parts = [density_of(points[i : i + chunk]).cpu() for i in range(0, len(points), chunk)]
         return torch.cat(parts).reshape(*shape).numpy()
 
-    coarse = 64
-    step = 2 * half_side / coarse
+    def main_pieces(opaque: np.ndarray) -> np.ndarray:
+        pieces, count = label(opaque)
+        sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+        sizes[0] = 0
+        return (sizes >= smallest_piece * sizes.max(initial=1))[pieces]
+
+    step = 2 * half_side / 64
     # exp(-density * length) = 1/2; coarse cells may hold thin parts, so less is asked of them.
-    opaque = np.argwhere(sample(np.full(3, -half_side), step, (coarse,) * 3) > 0.25 * math.log(2) / step)
+    coarse = sample(np.full(3, -half_side), step, (64,) * 3) > 0.25 * math.log(2) / step
+    opaque = np.argwhere(main_pieces(coarse) & coarse)
     if not len(opaque):
         return None
     lower = -half_side + step * (opaque.min(0) - 1)
     upper = -half_side + step * (opaque.max(0) + 2)
     extent = float((upper - lower).max())
     step = extent / resolution
-    shape = np.ceil((upper - lower) / step).astype(int)
-    values = np.pad(sample(lower, step, shape), 1)
+    values = sample(lower, step, np.ceil((upper - lower) / step).astype(int))
     level = math.log(2) / (extent / 30)
+    small = (values > level) & ~main_pieces(values > level)
+    values = np.pad(np.where(small, 0, values), 1)
     if not values.max() > level:
         return None
-    # The logarithm of an exponential field is close to linear between voxels.
-    vertices, faces, normals, _ = marching_cubes(
-        np.log(values + 1e-6), math.log(level), gradient_direction="descent"
+    # The logarithm of an exponential field is close to linear between voxels. Skimage's "ascent" faces outwards.
+    vertices, faces, _, _ = marching_cubes(
+        np.log(values + 1e-6), math.log(level), gradient_direction="ascent"
     )
     local = lower + step * (vertices - 0.5)
-    points = torch.from_numpy(local).float()
-    inward = -torch.nn.functional.normalize(torch.from_numpy(normals.copy()).float(), dim=-1)
+    outward = Trimesh(local, faces, process=False).vertex_normals
+    points, inward = torch.from_numpy(local).float(), torch.from_numpy(-outward).float()
     with torch.no_grad():
         parts = [
             colour_of(points[i : i + chunk], inward[i : i + chunk]).cpu()

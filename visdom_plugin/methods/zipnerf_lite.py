@@ -20,6 +20,7 @@ from visdom_plugin.methods.radiance import (
     photograph_on,
     render_image,
     silhouette_loss,
+    warm_up,
 )
 from visdom_plugin.nerf.contraction import contract
 from visdom_plugin.nerf.directions import encode_sinusoids
@@ -128,6 +129,8 @@ class ZipNerfLite:
         named = dict(self.model.named_parameters())
         self.optimiser = FieldOptimiser([(named, 0.0)], betas=(0.9, 0.99), eps=1e-15)
         self.metrics: dict[str, float] = {}
+        if device.type == "cpu":
+            warm_up(self, views.cameras[0])
 
     def pixels_per_step(self, step: int) -> int:
         return self.config.rays

@@ -108,6 +108,13 @@ class OccupancyGrid:
         self.reachable = grown.to(self.reachable.device)
         self.occupied = self.occupied & self.reachable
 
+    def is_occupied(self, points: Tensor) -> Tensor:
+        """(...) bool of points (..., 3); False outside the cube."""
+        n = self.resolution
+        cell = ((points + self.half_side) * (n / (2 * self.half_side))).floor().long()
+        x, y, z = cell.clamp(0, n - 1).unbind(-1)
+        return ((cell >= 0) & (cell < n)).all(-1) & self.occupied[x, y, z]
+
     def state_dict(self) -> dict[str, Tensor]:
         return {"density": self.density, "occupied": self.occupied.to(torch.uint8)}
 
@@ -226,11 +233,7 @@ def _march_torch(origins, directions, near, far, step, shift, grid: OccupancyGri
     starts = near[:, None] + (index + shift[:, None]) * step[:, None]
     middles = starts + 0.5 * step[:, None]
     points = origins[:, None] + middles[..., None] * directions[:, None]
-    n = grid.resolution
-    cell = ((points + grid.half_side) * (n / (2 * grid.half_side))).floor().long()
-    inside = ((cell >= 0) & (cell < n)).all(-1) & (middles < far[:, None])
-    x, y, z = cell.clamp(0, n - 1).unbind(-1)
-    taken = inside & grid.occupied[x, y, z]
+    taken = (middles < far[:, None]) & grid.is_occupied(points)
     ray, which = taken.nonzero(as_tuple=True)
     offsets = torch.cat([ray.new_zeros(1), taken.sum(1).cumsum(0)])
     return PackedSamples(offsets, ray, starts[ray, which], starts[ray, which] + step[ray])
