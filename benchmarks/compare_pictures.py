@@ -46,7 +46,7 @@ def main(argv: list[str]) -> None:
                 raise ConfigError(f"{path} has no picture of {names[i]}", todo="run visdom-eval on it")
             pictures.append(image[..., ::-1])
         columns.append((names[i], pictures))
-    rows = ["truth", *(record["method"].removeprefix("3dgs-go") or "bare" for record in records)]
+    rows = ["truth", *(record["method"] for record in records)]
     write_png(args.out, draw_sheet(columns, rows))
 
 

@@ -51,7 +51,7 @@ def draw_sheet(columns: list[tuple[str, list[np.ndarray]]], rows: list[str]) -> 
     """
     import cv2
 
-    margin, top, gap = 62, 24, 4
+    margin, top, gap = max(62, 14 + 8 * max(map(len, rows))), 24, 4
     cells = []
     for _, pictures in columns:
         h, w = pictures[0].shape[:2]
