@@ -352,7 +352,8 @@ class Coherence(NamedTuple):
 def measure_coherence(
     outlines: Outlines, per_view: int = 256, step_px: float = 1.0, *, power: bool = True
 ) -> Coherence:
-    """Marches rays of every mask: first wherever three views see, then round the place found.
+    """Marches rays of every mask: first wherever three views see (two, where three
+    agree nowhere), then round the place found.
 
     Args:
         per_view: rays of each mask, and half as many beside it.
@@ -360,8 +361,12 @@ def measure_coherence(
     """
     views = len(outlines)
     view, uv = choose_pixels(outlines, per_view)
-    found = march_rays(outlines, view, uv, least=min(2, views - 1), step_px=2 * step_px)
-    ball = _place(found)
+    ball = None
+    for least in range(min(2, views - 1), 0, -1):
+        found = march_rays(outlines, view, uv, least=least, step_px=2 * step_px)
+        ball = _place(found)
+        if ball is not None:
+            break
     beside = None
     if ball is not None:
         found = march_rays(outlines, view, uv, least=1, ball=ball, step_px=step_px)

@@ -28,6 +28,7 @@ _MOST_ROUNDS = 3
 _POWER, _LEAST_POWER_PX, _TIE = 0.8, 0.5, 0.9
 _SIMPLE = ("axes", "scale", "swapped", "order")
 _GAIN = 1.05
+_LEAST_FOR_TWO = 6
 
 
 class Suspicion(NamedTuple):
@@ -77,6 +78,13 @@ def explain(outlines: Outlines, *, brief: bool = False) -> tuple[list[Suspicion]
         index = np.flatnonzero(left)
         cause, changed, stays = _best_cause(outlines.keep(index), fit, rays, brief)
         if cause is None:
+            pair = _two_views(outlines.keep(index), fit, rays)
+            if pair is None:
+                break
+            views, after = pair
+            found += [Suspicion("view", (int(index[v]),), "", fit.score, after) for v in views]
+            left[index[list(views)]] = False
+            fit = measure_coherence(outlines.keep(left), rays)
             break
         views = tuple(int(index[i]) for i in cause.views)
         found.append(cause._replace(views=views, rivals=tuple(int(index[i]) for i in cause.rivals)))
@@ -136,6 +144,22 @@ def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool):
     stays[culprit] = False
     detail = "" if rivals or brief else _explain_view(outlines, culprit, rays, fit)
     return Suspicion("view", (culprit,), detail, before, float(alone[culprit]), rivals), outlines, stays
+
+
+def _two_views(outlines: Outlines, fit: Coherence, rays: int) -> tuple[tuple[int, int], float] | None:
+    """Two views without which the others fit, and how well; None when there is no such pair, or several."""
+    count = len(outlines)
+    if count < _LEAST_FOR_TWO:
+        return None
+    scores = {}
+    for first in np.argsort([fit.score_without(i) for i in range(count)])[:4].tolist():
+        rest = np.delete(np.arange(count), first)
+        without = measure_coherence(outlines.keep(rest), rays, power=False)
+        for k, second in enumerate(rest.tolist()):
+            scores[min(first, second), max(first, second)] = without.score_without(k)
+    (views, after), (_, next_best) = sorted(scores.items(), key=lambda item: item[1])[:2]
+    clear = after <= _RATIO * fit.score and 2 * after + _FLOOR_PX < next_best
+    return (views, after) if clear else None
 
 
 def _whole_trials(count: int, alone: np.ndarray, fit: Coherence, brief: bool) -> Iterator[_Trial]:
@@ -201,11 +225,15 @@ def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence) -> s
         ("its mask is inverted", lambda o: _fields(o, lambda f: -f)),
     ]
     alone, power = fit.score_without(view), fit.power_without(view)
-    best, said = _GAIN * power, ""
+    best, said, enough = _GAIN * power, "", max(2 * alone, _FLOOR_PX)
+    fewer = int(np.clip(_TRIAL_RAYS // len(outlines), 8, 64))
     for detail, change in trials:
-        after = measure_coherence(one(change), rays)
+        changed = one(change)
+        if measure_coherence(changed, fewer, 2.0, power=False).score > 2 * enough:
+            continue
+        after = measure_coherence(changed, rays)
         # A view that is mended narrows the hull down; one that merely falls silent does not.
-        if after.score <= max(2 * alone, _FLOOR_PX) and after.power > best:
+        if after.score <= enough and after.power > best:
             best, said = after.power, detail
     return said
 
