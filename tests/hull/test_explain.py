@@ -142,7 +142,8 @@ def test_drawn_silhouettes_are_those_of_every_voxel(seed, fill):
         occupancy = ndimage.binary_closing(np.pad(occupancy, 2), iterations=2)[2:-2, 2:-2, 2:-2] | occupancy
     pieces = find_pieces(occupancy)
     labels, count = ndimage.label(occupancy, np.ones((3, 3, 3)))
-    runs, bounds = explain._shell(pieces, occupancy)
+    once = np.ones(len(pieces.sizes), np.int64)
+    runs, bounds = explain._shell(pieces, occupancy, once)
     focal = np.linalg.norm(silhouettes.projections[:, :2, :3], axis=-1).mean(-1)
     areas = sum_areas(silhouettes)
     canvas = explain._lay_out(silhouettes, areas, focal * grid.voxel, grid.lower + random.random(3))
@@ -152,7 +153,7 @@ def test_drawn_silhouettes_are_those_of_every_voxel(seed, fill):
         padded = np.pad(mask, [(0, -n % factor) for n in mask.shape])
         blocks = padded.reshape(height - 2, factor, width - 2, factor).any((1, 3))
         assert np.array_equal(coarse, np.pad(blocks, 1))
-    drawn = explain._draw(runs, bounds, grid, silhouettes, canvas, focal)
+    drawn = explain._draw(runs, bounds, once, grid, silhouettes, canvas, focal)
     occupied = np.argwhere(occupancy)
     first = {int(label): n for n, label in enumerate(dict.fromkeys(labels[occupancy].tolist()))}
     numbers = np.array([first[int(label)] for label in labels[occupancy]])
@@ -201,6 +202,31 @@ def test_a_piece_stays_when_better_ones_leave_it_pixels(seed):
         says = (fresh >= 4) & (fresh >= 0.2 * own[piece])
         enough = says.sum() >= 2 or (says & (fresh >= 0.01 * total)).any()
         assert keep[piece] == (enough and (own[piece] > 0).sum() >= 2)
+
+
+@pytest.mark.parametrize("stretch", [2, 4])
+def test_a_sample_of_a_large_piece_draws_its_silhouette(stretch):
+    cameras = ring(3, size=64)
+    silhouettes = gather_silhouettes(cameras, [torch.ones(64, 64, dtype=torch.bool)] * 3)
+    grid = Grid(np.full(3, -0.6), 1.2 / 120, (120, 120, 120))
+    axis = np.arange(120) - 59.5
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    occupancy = (x**2 + y**2 + z**2 < 50**2) & (np.abs(x + y) > 12) & ((np.abs(z) < 20) | (x < 30))
+    pieces = find_pieces(occupancy)
+    focal = np.linalg.norm(silhouettes.projections[:, :2, :3], axis=-1).mean(-1)
+    canvas = explain._lay_out(silhouettes, sum_areas(silhouettes), focal * grid.voxel, np.zeros(3))
+    pictures, lengths = [], []
+    for times in (1, stretch):
+        factor = np.full(len(pieces.sizes), times)
+        runs, bounds = explain._shell(pieces, occupancy, factor)
+        drawn = explain._draw(runs, bounds, factor, grid, silhouettes, canvas, focal)
+        picture = np.zeros(len(canvas.foreground), bool)
+        picture[drawn.pixels] = True
+        pictures.append(picture.reshape(3, 66, 66))
+        lengths.append((runs[:, 3] - runs[:, 2]).sum())
+    wide = [ndimage.binary_dilation(p, np.ones((1, 3, 3))) for p in pictures]
+    assert lengths[1] < 1.3 * lengths[0] / stretch**2
+    assert not (pictures[0] & ~wide[1]).any() and not (pictures[1] & ~wide[0]).any() and pictures[0].any()
 
 
 def test_order_of_the_views_does_not_matter():

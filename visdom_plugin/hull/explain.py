@@ -29,6 +29,8 @@ _LEAST_OF_MASK = 0.01
 disagrees with the others is explained by whatever lies there, mostly by strays near a camera."""
 _BETTER = 2.0
 """How many times the foreground of a piece another one must explain, as a share of the masks, to be better."""
+_LARGE, _FINE = 1 << 18, 384
+"""Voxels from which a piece is drawn by a sample of its surface, in grids of more than so many along a side."""
 _LARGEST_HALF = 16.0
 """Voxels right in front of a camera are drawn at most this large (half a side), in working pixels."""
 
@@ -73,32 +75,36 @@ def explaining_pieces(
     """
     if len(pieces.sizes) < 2:
         return np.ones(len(pieces.sizes), bool)
-    runs, bounds = _shell(pieces, occupancy)
+    thin = 2 if max(occupancy.shape) > _FINE else 1
+    thin *= 2 if max(occupancy.shape) > 2 * _FINE else 1
+    stretch = np.where(pieces.sizes >= _LARGE, thin, 1)
+    runs, bounds = _shell(pieces, occupancy, stretch)
     largest = runs[slice(*bounds[pieces.sizes.argmax() :][:2])]
     middle = np.append(largest[:, :2] + 0.5, largest[:, 2:].mean(1, keepdims=True), 1).mean(0)
     focal = np.linalg.norm(silhouettes.projections[:, :2, :3], axis=-1).mean(-1)
     canvas = _lay_out(silhouettes, areas, focal * grid.voxel, grid.lower + middle * grid.voxel)
-    drawn = _draw(runs, bounds, grid, silhouettes, canvas, focal)
+    drawn = _draw(runs, bounds, stretch, grid, silhouettes, canvas, focal)
     least_views = int(np.argmax(rule.table().any(0)))
     return _choose(drawn, canvas, least_views)
 
 
-def _shell(pieces: Pieces, occupancy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _shell(pieces: Pieces, occupancy: np.ndarray, stretch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Runs (R, 4) of x, y, first z and one past the last z of the voxels with a free face, sorted by piece; and
     where each piece's begin (C + 1,)."""
     order = np.argsort(pieces.labels, kind="stable")
     column = np.repeat(np.arange(len(pieces.column_starts) - 1), np.diff(pieces.column_starts))[order]
     whole = np.stack([*np.divmod(column, occupancy.shape[1]), pieces.begins[order], pieces.ends[order]], -1)
+    coarse = stretch[pieces.labels[order]]
     grid, counts = occupancy.view(np.uint8), np.zeros(len(whole), np.int64)
-    spread(_list_shell, len(whole), 4096, whole, grid, counts, np.empty((0, 4), np.int64))
+    spread(_list_shell, len(whole), 4096, whole, coarse, grid, counts, np.empty((0, 4), np.int64))
     starts = np.concatenate([[0], np.cumsum(counts)])
     runs = np.empty((starts[-1], 4), np.int64)
-    spread(_list_shell, len(whole), 4096, whole, grid, starts, runs)
+    spread(_list_shell, len(whole), 4096, whole, coarse, grid, starts, runs)
     return runs, starts[np.searchsorted(pieces.labels[order], np.arange(len(pieces.sizes) + 1))]
 
 
 @njit(cache=True, nogil=True)
-def _list_shell(begin, end, whole, grid, starts, runs):
+def _list_shell(begin, end, whole, coarse, grid, starts, runs):
     """Counts in `starts`, or lists from there on in `runs` unless that is empty."""
     nx, ny, _ = grid.shape
     for r in range(begin, end):
@@ -106,7 +112,10 @@ def _list_shell(begin, end, whole, grid, starts, runs):
         rim = i == 0 or j == 0 or i == nx - 1 or j == ny - 1
         found = starts[r]
         before = False
-        for k in range(first, stop):
+        # Where i + 3 j + 5 k is a multiple of the square: evenly spread over faces of any direction. 13 is the
+        # inverse of 5 modulo 16 and modulo 4.
+        every = coarse[r] * coarse[r]
+        for k in range(first + (-13 * (i + 3 * j) - first) % every, stop, every):
             free = rim or k == first or k == stop - 1
             if not free:
                 free = not (grid[i - 1, j, k] & grid[i + 1, j, k] & grid[i, j - 1, k] & grid[i, j + 1, k])
@@ -116,7 +125,7 @@ def _list_shell(begin, end, whole, grid, starts, runs):
                 found += 1
             if free and len(runs):
                 runs[found - 1, 3] = k + 1
-            before = free
+            before = free and every == 1
         if not len(runs):
             starts[r] = found
 
@@ -140,7 +149,9 @@ def _lay_out(silhouettes: Silhouettes, areas, edge_px: np.ndarray, about: np.nda
 
 
 @njit(cache=True, nogil=True)
-def _trace(begin, end, runs, bounds, x, y, z, edge_px, factors, sizes, offsets, foreground, starts, pixels):
+def _trace(
+    begin, end, runs, bounds, stretch, x, y, z, edge_px, factors, sizes, offsets, foreground, starts, pixels
+):
     """Counts in `starts`, or lists from there on in `pixels` unless that is empty, what pieces cover in views."""
     for view in range(begin, end):
         width, height = sizes[view]
@@ -157,7 +168,7 @@ def _trace(begin, end, runs, bounds, x, y, z, edge_px, factors, sizes, offsets, 
                     closeness = scale / depth
                     u = (x[view, 0, i] + y[view, 0, j] + z[view, 0, k]) * closeness + 1
                     v = (x[view, 1, i] + y[view, 1, j] + z[view, 1, k]) * closeness + 1
-                    half = min(0.5 * edge_px[view] * closeness, _LARGEST_HALF)
+                    half = min(0.5 * edge_px[view] * stretch[piece] * closeness, _LARGEST_HALF)
                     if u + half < 1 or v + half < 1 or u - half >= width - 1 or v - half >= height - 1:
                         continue
                     left, right = max(int(u - half), 1), min(int(u + half), width - 2)
@@ -173,9 +184,11 @@ def _trace(begin, end, runs, bounds, x, y, z, edge_px, factors, sizes, offsets, 
                 starts[piece, view] = found
 
 
-def _draw(runs, bounds, grid: Grid, silhouettes: Silhouettes, canvas: _Canvas, focal: np.ndarray) -> _Drawn:
+def _draw(
+    runs, bounds, stretch, grid: Grid, silhouettes: Silhouettes, canvas: _Canvas, focal: np.ndarray
+) -> _Drawn:
     terms = axis_terms(silhouettes.projections, [grid.centres(a) for a in range(3)])
-    inputs = (runs, bounds, *terms, focal * grid.voxel, *canvas)
+    inputs = (runs, bounds, stretch, *terms, focal * grid.voxel, *canvas)
     views = len(silhouettes)
     counts = np.zeros((len(bounds) - 1, views), np.int64)
     spread(_trace, views, 1, *inputs, counts, np.empty(0, np.int32))
