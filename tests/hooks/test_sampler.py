@@ -120,7 +120,9 @@ def test_the_unit_of_epsilon_is_what_its_name_says(hull):
     views = Views(cameras, [None] * 5, [None] * 5, list("abcde"))
     mean = (cameras.centres.numpy() - hull.centre) ** 2
     expected = 0.2 * np.sqrt(mean.sum(-1)).mean()
-    assert SamplerConfig().build(hull, views).epsilon_world == pytest.approx(expected)
+    assert SamplerConfig(epsilon_camera_distances=0.2).build(hull, views).epsilon_world == pytest.approx(
+        expected
+    )
     assert SamplerConfig(epsilon_world=0.7).build(hull, views).epsilon_world == 0.7
     assert SamplerConfig(epsilon_hull_radii=2.0).build(hull, views).epsilon_world == pytest.approx(
         2 * hull.radius
@@ -132,7 +134,7 @@ def test_the_unit_of_epsilon_is_what_its_name_says(hull):
     [
         {"epsilon_world": -1.0},
         {"epsilon_world": float("nan")},
-        {"epsilon_world": 0.0},
+        {"epsilon_world": 0.0, "interval": "first_hit"},
         {"epsilon_world": 0.1, "epsilon_hull_radii": 0.1},
         {"interval": "exit"},
         {"missing": "drop"},

@@ -66,7 +66,7 @@ def test_it_learns(scene, hull):
     mask = scene.train.masks[0][..., None]
     truth = torch.where(mask, scene.train.images[0].float() / 255, 1.0)
     assert sum(history[-8:]) < 0.8 * sum(history[:8])
-    assert (after - truth).square().mean() < 0.6 * (before - truth).square().mean()
+    assert (after - truth).square().mean() < 0.7 * (before - truth).square().mean()
 
 
 def test_a_resumed_run_equals_the_uninterrupted_one(scene, hull):
