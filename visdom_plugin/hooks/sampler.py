@@ -12,8 +12,8 @@ from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.raycast import cast
 
-DEFAULT_EPSILON_HULL_RADII = 0.6
-"""About the paper's 0.2 camera distances for an object that fills half the picture; FINDINGS.md has the sweep."""
+DEFAULT_EPSILON_HULL_RADII = 0.1
+"""About 0.03 camera distances for an object that fills half the picture; FINDINGS.md has the sweep."""
 
 
 class VisDomSampler:
