@@ -212,7 +212,10 @@ def _cause(cause: Suspicion, usable: np.ndarray, names: Name, fit: Coherence) ->
     for kind, others, detail in cause.others[:3]:
         other = names.all_of([int(usable[v]) for v in others]) + ": " if others else ""
         what += f"; or {other}{detail}" if kind != "swapped" else f"; or {other}exchanged"
-    ratio = cause.after / cause.before
+    if cause.before <= QUIET_PX:
+        gain = "as given, no view rules out anything for another; undone they do, and miss each other by "
+        gain += f"{_share(cause.after)} of the object's length in the mean"
+    ratio = min(cause.after / max(cause.before, 1e-9), 1.0)
     sure = "certain" if cause.before > _DISAGREE_PX and ratio < 0.1 else "likely"
     sure = "possible" if cause.rivals or cause.others else sure
     alternatives = tuple(sorted({kind for kind, _, _ in cause.others}))

@@ -29,6 +29,7 @@ _POWER, _LEAST_POWER_PX, _TIE = 0.8, 0.5, 0.9
 _SIMPLE = ("axes", "scale", "swapped", "order")
 _GAIN = 1.05
 _LEAST_FOR_TWO = 6
+_FAR_OFF = 0.2
 
 
 class Suspicion(NamedTuple):
@@ -73,12 +74,13 @@ def explain(outlines: Outlines, *, brief: bool = False) -> tuple[list[Suspicion]
     rays = int(np.clip((_BRIEF_RAYS if brief else _MOST_RAYS) // len(outlines), 16, 256))
     fit = measure_coherence(outlines, rays)
     for _ in range(_MOST_ROUNDS):
-        if fit.score <= QUIET_PX or left.sum() < 2:
+        # Views that share nothing agree on everything, and that is suspicious too.
+        if left.sum() < 2 or (fit.score <= QUIET_PX and (fit.power >= _LEAST_POWER_PX or left.sum() < 3)):
             break
         index = np.flatnonzero(left)
         cause, changed, stays = _best_cause(outlines.keep(index), fit, rays, brief)
         if cause is None:
-            pair = _two_views(outlines.keep(index), fit, rays)
+            pair = _two_views(outlines.keep(index), fit, rays) if fit.score > QUIET_PX else None
             if pair is None:
                 break
             views, after = pair
@@ -103,13 +105,17 @@ def explain(outlines: Outlines, *, brief: bool = False) -> tuple[list[Suspicion]
 def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool):
     """The cause that explains most, the changed outlines and the views that stay; (None, ...) for none."""
     count, before = len(outlines), fit.score
-    enough = _RATIO * before
+    silent = before <= QUIET_PX
+    enough = QUIET_PX if silent else _RATIO * before
     fewer = int(np.clip(_TRIAL_RAYS // count, 8, 64))
     alone = np.array([fit.score_without(i) for i in range(count)]) if count >= 3 else np.full(count, np.inf)
     culprit = int(np.argmin(alone))
     tried = []
     for trial in _whole_trials(count, alone, fit, brief):
         changed = trial.change(outlines)
+        # Where masks are silent the principal points must speak: any longer lens makes views more selective.
+        if silent and not (_off_centre(outlines) > _FAR_OFF and _off_centre(changed) < _FAR_OFF / 2):
+            continue
         # Few rays do to rule a trial out.
         if measure_coherence(changed, fewer, 2.0, power=False).score <= 2 * enough:
             after = measure_coherence(changed, rays)
@@ -127,9 +133,13 @@ def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool):
         )
         best, changed, after = tried[0]
         others = tuple(t[0][:3] for t in tried[1:] if t[0].kind != best.kind or best.kind == "swapped")
-        fits = not alone_fits or (
-            after.score <= max(alone[culprit], _FLOOR_PX)
-            and after.power >= _POWER * fit.power_without(culprit)
+        fits = (
+            silent
+            or not alone_fits
+            or (
+                after.score <= max(alone[culprit], _FLOOR_PX)
+                and after.power >= _POWER * fit.power_without(culprit)
+            )
         )
         if fits and after.power > _LEAST_POWER_PX:
             return (
@@ -137,13 +147,19 @@ def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool):
                 changed,
                 stays,
             )
-    if not alone_fits:
+    if silent or not alone_fits:
         return None, outlines, stays
     close = alone <= max(2 * alone[culprit], alone[culprit] + _FLOOR_PX)
     rivals = tuple(int(i) for i in np.flatnonzero(close) if i != culprit)
     stays[culprit] = False
     detail = "" if rivals or brief else _explain_view(outlines, culprit, rays, fit)
     return Suspicion("view", (culprit,), detail, before, float(alone[culprit]), rivals), outlines, stays
+
+
+def _off_centre(outlines: Outlines) -> float:
+    """Median distance of the principal points from the images' centres, in image sizes."""
+    sizes = np.array([f.shape[::-1] for f in outlines.fields])
+    return float(np.median(np.abs(outlines.intrinsics[:, :2, 2] / sizes - 0.5).max(1)))
 
 
 def _two_views(outlines: Outlines, fit: Coherence, rays: int) -> tuple[tuple[int, int], float] | None:
