@@ -18,14 +18,13 @@ from visdom_plugin.hull.coherence import (
     CAP_PX,
     SLACK_PX,
     choose_pixels,
-    draw_outlines,
     march_rays,
     measure_coherence,
-    signed_distance,
 )
 from visdom_plugin.hull.covisibility import advise_k, measure_spread
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.maskfaults import border_contact, count_specks
+from visdom_plugin.hull.outlines import draw_outlines, signed_distance
 from visdom_plugin.hull.votes import gather_silhouettes
 
 BOX = ((-0.4, -0.5, -0.3), (0.5, 0.3, 0.4))

@@ -155,7 +155,7 @@ def _report(scene: Scene, views: Views, found: Check) -> dict[str, Any]:
             for k, shares in found.advice.covered.items()
         }
     if found.fit is not None:
-        from visdom_plugin.hull.coherence import OBJECT_PX
+        from visdom_plugin.hull.outlines import OBJECT_PX
 
         report["misfit"] = round(found.fit.score / OBJECT_PX, 6)
         report["constraint"] = round(found.fit.power / OBJECT_PX, 6)

@@ -13,8 +13,9 @@ import numpy as np
 import torch
 
 from visdom_plugin.hull.carve import carve_silhouettes
-from visdom_plugin.hull.coherence import TOLERANCE_PX, draw_outlines, march_rays
+from visdom_plugin.hull.coherence import TOLERANCE_PX, march_rays
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.outlines import draw_outlines
 from visdom_plugin.hull.raycast import depth_and_silhouette
 from visdom_plugin.hull.votes import gather_silhouettes
 

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 
 from visdom_plugin.cameras import Cameras, look_at_point
-from visdom_plugin.hull.coherence import OBJECT_PX, Coherence, Outlines, draw_outlines, measure_coherence
+from visdom_plugin.hull.coherence import Coherence, measure_coherence
 from visdom_plugin.hull.covisibility import LOST, USUAL_K, Advice, advise_k, measure_spread
 from visdom_plugin.hull.diagnose import look_inverted
 from visdom_plugin.hull.findings import Finding, Name
 from visdom_plugin.hull.maskfaults import check_border, check_content, check_sizes, find_repeated
+from visdom_plugin.hull.outlines import OBJECT_PX, Outlines, draw_outlines
 from visdom_plugin.hull.suspects import QUIET_PX, Suspicion, explain
 from visdom_plugin.hull.votes import gather_silhouettes
 

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from visdom_plugin.hull.coherence import Coherence, Outlines, choose_pixels, march_rays, measure_coherence
+from visdom_plugin.hull.coherence import Coherence, choose_pixels, march_rays, measure_coherence
 from visdom_plugin.hull.findings import Name
+from visdom_plugin.hull.outlines import Outlines
 
 USUAL_K = 3
 LOST = 0.02

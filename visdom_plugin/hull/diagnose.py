@@ -12,10 +12,10 @@ import numpy as np
 from visdom_plugin.cameras import Cameras
 from visdom_plugin.hull.blocks import block_carve, sum_areas
 from visdom_plugin.hull.carve import keep_rule
-from visdom_plugin.hull.coherence import draw_outlines
 from visdom_plugin.hull.covisibility import advise_k
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
+from visdom_plugin.hull.outlines import draw_outlines
 from visdom_plugin.hull.raycast import depth_and_silhouette
 from visdom_plugin.hull.region import grid_in
 from visdom_plugin.hull.rule import KeepRule

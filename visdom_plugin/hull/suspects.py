@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from visdom_plugin.hull.coherence import Coherence, Outlines, measure_coherence
+from visdom_plugin.hull.coherence import Coherence, measure_coherence
+from visdom_plugin.hull.outlines import Outlines
 
 QUIET_PX = 0.015
 """Mean residual (in pixels of the fields, an object is 128 long) below which nothing is looked for: sound captures
