@@ -12,6 +12,7 @@ from datamodules.synthetic import SyntheticConfig, make_scene
 from method_configs import ingp, zipnerf_lite
 from visdom_plugin import registry
 from visdom_plugin.cameras import rays_of
+from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.domain import VisibleDomain
@@ -259,3 +260,20 @@ def test_variants_differ_only_in_what_they_name():
             assert replace(getattr(vd, budget), **kept) == base
             assert base.mask_weight == 0 and base.background == "white" and not base.vd.enabled
     assert registry.find("zipnerf+vd") is registry.find("zipnerf-lite+vd")
+
+
+@pytest.mark.parametrize(
+    ("method_class", "wrong"),
+    [
+        (Ingp, {"occupancy_resolution": 0}),
+        (Ingp, {"view_degree": 9}),
+        (Ingp, {"step_length": float("nan")}),
+        (ZipNerfLite, {"samples": (1, 8, 8)}),
+        (ZipNerfLite, {"far": 0.01}),
+        (Ingp, {"hull": None}),
+        (ZipNerfLite, {"hull": None}),
+    ],
+)
+def test_settings_out_of_range_are_named_before_anything_is_built(method_class, wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        replace(SMALL[method_class], **wrong)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.nerf.hash_layout import HashLayout
@@ -74,6 +75,34 @@ class GsGoConfig:
     """The visible-domain hook."""
 
 
+def _demand(config: object, conditions: dict[str, tuple[bool, str]]) -> None:
+    """Refuses a setting out of range before anything is built.
+
+    Args:
+        conditions: by setting's name, whether it is in range, and the range.
+
+    Raises:
+        ConfigError: naming the first one that is not.
+    """
+    for name, (holds, allowed) in conditions.items():
+        if not holds:
+            option = name.replace("_", "-")
+            raise ConfigError(
+                f"{name} = {getattr(config, name)} is out of range",
+                where=f"{type(config).__name__}, --method.{option}",
+                todo=f"choose {allowed}",
+            )
+
+
+def _demand_hull(config: IngpConfig | ZipNerfConfig) -> None:
+    if config.hull is None and (config.vd.enabled or config.vd.hull_at_inference):
+        raise ConfigError(
+            "the visible-domain hook is asked for, but no hull to go with it",
+            where=type(config).__name__,
+            todo="start from the variant +vd, which has both",
+        )
+
+
 @dataclass(frozen=True)
 class IngpConfig:
     """Instant-NGP (Müller et al. 2022). Lengths are in mean camera distances unless their name says otherwise.
@@ -134,6 +163,30 @@ class IngpConfig:
     """The hull of the visible-domain hook; carved when there is one."""
     vd: SamplerConfig = field(default_factory=SamplerConfig)
     """The visible-domain hook."""
+
+    def __post_init__(self) -> None:
+        positive = ("half_side", "step_length", "missing_step_length", "lr", "occupancy_alpha")
+        counts = (
+            "max_rays",
+            "samples_per_step",
+            "hidden",
+            "geometry_features",
+            "occupancy_resolution",
+            "occupancy_every",
+        )
+        _demand(
+            self,
+            {name: (getattr(self, name) > 0, "a positive number") for name in positive}
+            | {name: (getattr(self, name) >= 1, "1 or more") for name in counts}
+            | {
+                "steps": (self.steps >= 0, "0 or more"),
+                "near": (self.near >= 0, "0 or more"),
+                "view_degree": (0 <= self.view_degree <= 4, "0 to 4"),
+                "mask_weight": (self.mask_weight >= 0, "0 or more"),
+                "occupancy_fraction": (0 < self.occupancy_fraction <= 1, "a share above 0, at most 1"),
+            },
+        )
+        _demand_hull(self)
 
 
 @dataclass(frozen=True)
@@ -201,3 +254,24 @@ class ZipNerfConfig:
     """The hull of the visible-domain hook; carved when there is one."""
     vd: SamplerConfig = field(default_factory=SamplerConfig)
     """The visible-domain hook."""
+
+    def __post_init__(self) -> None:
+        counts = ("rays", "hidden", "bottleneck", "colour_hidden", "colour_layers")
+        weights = ("mask_weight", "interlevel_weight", "distortion_weight", "hash_decay")
+        positive = ("lr", "lr_final", "anneal_slope")
+        _demand(
+            self,
+            {name: (getattr(self, name) >= 1, "1 or more") for name in counts}
+            | {name: (getattr(self, name) >= 0, "0 or more") for name in weights}
+            | {name: (getattr(self, name) > 0, "a positive number") for name in positive}
+            | {
+                "steps": (self.steps >= 0, "0 or more"),
+                "near": (self.near >= 0, "0 or more"),
+                "far": (self.far > self.near, f"more than near, {self.near}"),
+                "samples": (min(self.samples) >= 2, "2 or more for each level"),
+                "test_samples": (min(self.test_samples or (2,)) >= 2, "2 or more for each level"),
+                "blur": (min(self.blur) > 0, "positive numbers"),
+                "view_degree": (self.view_degree >= 0, "0 or more"),
+            },
+        )
+        _demand_hull(self)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,8 +32,6 @@ from visdom_plugin.nerf.volume_packed import composite_packed
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
-
-log = logging.getLogger(__name__)
 
 HUBER_DELTA = 0.1  # Instant-NGP
 RAYS_AT_ONCE = 1 << 14
