@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.methods.configs import GsGoConfig
+from visdom_plugin.methods.splat_configs import GsGoConfig
 from visdom_plugin.registry import Preset
 
 FULL = GsGoConfig()

@@ -1,4 +1,4 @@
-"""Settings of the methods: plain data, free of heavy imports. Defaults are the published schedules."""
+"""Settings of the radiance fields: plain data, free of heavy imports. Defaults are the published schedules."""
 
 from __future__ import annotations
 
@@ -6,92 +6,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
+from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.methods.demands import demand
 from visdom_plugin.nerf.hash_layout import HashLayout
-
-
-@dataclass(frozen=True)
-class GsGoConfig:
-    """3DGS-GO: the coarse stage of GaussianObject (Yang et al. 2024), without its diffusion repair."""
-
-    steps: int = 10_000
-    """Optimisation steps, one training view each."""
-    initial_points: int = 20_000
-    """Gaussians at the start, drawn from the hull."""
-    background: Literal["random", "white"] = "random"
-    """Training background behind render and photograph; tests are on white."""
-    max_gaussians: int = 3_000_000
-    """Densification stops growing beyond this."""
-
-    sh_degree: int = 2
-    """Highest degree of the spherical harmonics, 0 to 3."""
-    sh_every: int = 1_000
-    """Steps between two degrees; training starts at degree 0."""
-
-    ssim_weight: float = 0.2
-    """Image loss (1 - w) L1 + w (1 - SSIM)."""
-    mask_weight: float = 0.01
-    """lambda_2, binary cross entropy between rendered opacity and mask."""
-    depth_weight: float = 0.0005
-    """Shift- and scale-free L1 on disparities, where the scene comes with monocular depth."""
-
-    lr_means: float = 1.6e-4
-    """Positions, times the scene extent (1.1 x the farthest training camera from their mean)."""
-    lr_means_final: float = 1.6e-6
-    """Reached, log-linearly, after `lr_means_steps` steps."""
-    lr_means_steps: int = 30_000
-    """GaussianObject keeps 3DGS's 30,000 although it runs 10,000."""
-    lr_sh: float = 0.0025
-    """Colour; the higher harmonics learn at a twentieth."""
-    lr_opacity: float = 0.05
-    lr_scale: float = 0.005
-    lr_rotation: float = 0.001
-
-    densify_from: int = 500
-    densify_until: int = 6_000
-    densify_every: int = 100
-    densify_gradient: float = 0.0002
-    """Mean norm of the loss's gradient by the projected mean, in normalised device units (image = [-1, 1])."""
-    densify_scale: float = 0.01
-    """Larger Gaussians split, smaller ones are cloned; fraction of the extent."""
-    prune_opacity: float = 0.005
-    prune_large_from: int = 1_000
-    """From here on Gaussians too large on screen or in space are removed."""
-    prune_radius_px: float = 20.0
-    prune_scale: float = 0.1
-    """Fraction of the extent."""
-    opacity_reset_every: int = 1_000
-    """Until `densify_until`, opacities fall to 0.01 on every n-th step; 0 never."""
-
-    floater_every: int = 500
-    """Until `densify_until`, statistical removal of stray Gaussians on every n-th step; 0 never."""
-    floater_sigmas: tuple[float, float] = (1.0, 2.326)
-    """Its threshold in standard deviations, from the first to the last removal."""
-
-    hull: VisibleDomain = field(default_factory=lambda: VisibleDomain(kind="released-go"))
-    """Where the Gaussians start."""
-    vd: RegularizerConfig = field(default_factory=RegularizerConfig)
-    """The visible-domain hook."""
-
-
-def _demand(config: object, conditions: dict[str, tuple[bool, str]]) -> None:
-    """Refuses a setting out of range before anything is built.
-
-    Args:
-        conditions: by setting's name, whether it is in range, and the range.
-
-    Raises:
-        ConfigError: naming the first one that is not.
-    """
-    for name, (holds, allowed) in conditions.items():
-        if not holds:
-            option = name.replace("_", "-")
-            raise ConfigError(
-                f"{name} = {getattr(config, name)} is out of range",
-                where=f"{type(config).__name__}, --method.{option}",
-                todo=f"choose {allowed}",
-            )
 
 
 def _demand_hull(config: IngpConfig | ZipNerfConfig) -> None:
@@ -174,7 +92,7 @@ class IngpConfig:
             "occupancy_resolution",
             "occupancy_every",
         )
-        _demand(
+        demand(
             self,
             {name: (getattr(self, name) > 0, "a positive number") for name in positive}
             | {name: (getattr(self, name) >= 1, "1 or more") for name in counts}
@@ -259,7 +177,7 @@ class ZipNerfConfig:
         counts = ("rays", "hidden", "bottleneck", "colour_hidden", "colour_layers")
         weights = ("mask_weight", "interlevel_weight", "distortion_weight", "hash_decay")
         positive = ("lr", "lr_final", "anneal_slope")
-        _demand(
+        demand(
             self,
             {name: (getattr(self, name) >= 1, "1 or more") for name in counts}
             | {name: (getattr(self, name) >= 0, "0 or more") for name in weights}

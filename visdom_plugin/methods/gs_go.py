@@ -16,7 +16,7 @@ from torch import Tensor
 from visdom_plugin.cameras import Cameras, project
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.losses import composite, disparity_loss, mask_loss, photometric_loss
-from visdom_plugin.methods.configs import GsGoConfig
+from visdom_plugin.methods.splat_configs import GsGoConfig
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
