@@ -25,6 +25,8 @@ class SamplerConfig:
     """Rays that miss the hull: sampled over the method's full range, or not at all."""
     hull_at_inference: bool = False
     """Novel views, too, are sampled inside the band only, and rays that miss show the background."""
+    drop_outside: bool = False
+    """Of the samples in the band, those at points outside the hull count nothing (VaxNeRF; Instant-NGP only)."""
 
     def build(self, hull, views):
         """The hook for one hull, and the training views whose mean distance is the unit."""
@@ -37,7 +39,9 @@ class SamplerConfig:
             distances = ((c - hull.centre) @ (c - hull.centre) for c in views.cameras.centres.numpy())
             mean = sum(d**0.5 for d in distances) / len(views)
             epsilon = {"epsilon_world": self.epsilon_camera_distances * mean}
-        return VisDomSampler(hull, **epsilon, interval=self.interval, missing=self.missing)
+        return VisDomSampler(
+            hull, **epsilon, interval=self.interval, missing=self.missing, drop_outside=self.drop_outside
+        )
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,8 @@ class VisDomSampler:
         interval: see above.
         missing: what happens to rays that miss the hull. "full" leaves them the caller's bounds, so that a mask
             loss clears the space around the object; "skip" gives them an empty interval, near = far.
+        drop_outside: the method shall ask `keep` about each sample, too (VaxNeRF, Kondo et al. 2021). Bounds alone
+            let a ray sample the gaps between the parts of a hull.
 
     Raises:
         ConfigError: for a setting out of range, or an epsilon in two units.
@@ -52,6 +54,7 @@ class VisDomSampler:
         epsilon_world: float | None = None,
         interval: Literal["first_hit", "entry_exit"] = "entry_exit",
         missing: Literal["full", "skip"] = "full",
+        drop_outside: bool = False,
     ):
         if epsilon_hull_radii is not None and epsilon_world is not None:
             raise ConfigError(
@@ -73,7 +76,7 @@ class VisDomSampler:
                 todo="give a positive epsilon_hull_radii or epsilon_world",
             )
         self.hull, self.epsilon_world = hull, float(epsilon_world)
-        self.interval, self.missing = interval, missing
+        self.interval, self.missing, self.drop_outside = interval, missing, drop_outside
 
     def __call__(self, origins: Tensor, directions: Tensor, near, far) -> RayBounds:
         """The same as `bound`."""
@@ -103,3 +106,9 @@ class VisDomSampler:
         begin = torch.where(hit, begin, near)
         end = torch.where(hit, end, far if self.missing == "full" else near)
         return RayBounds(begin, end, hit)
+
+    def keep(self, points: Tensor) -> Tensor:
+        """(...) bool of sample points (..., 3), world frame: False where they shall count nothing."""
+        if not self.drop_outside:
+            return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
+        return self.hull.contains(points)

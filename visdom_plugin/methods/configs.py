@@ -19,6 +19,12 @@ def _demand_hull(config: IngpConfig | ZipNerfConfig) -> None:
             where=type(config).__name__,
             todo="start from the variant +vd, which has both",
         )
+    if config.vd.drop_outside and not isinstance(config, IngpConfig):
+        raise ConfigError(
+            "vd.drop_outside is on, but only Instant-NGP drops single samples",
+            where=f"{type(config).__name__}, --method.vd.drop-outside",
+            todo="leave it off, or train method:vaxnerf",
+        )
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from visdom_plugin.nerf.directions import encode_harmonics
 from visdom_plugin.nerf.fields import perceptron, truncated_exp
 from visdom_plugin.nerf.frame import frame_of
 from visdom_plugin.nerf.hash_grid import encode, initial_table
-from visdom_plugin.nerf.occupancy import OccupancyGrid, PackedSamples, intersect_cube, march
+from visdom_plugin.nerf.occupancy import OccupancyGrid, PackedSamples, intersect_cube, march, select
 from visdom_plugin.nerf.optimiser import FieldOptimiser, warm_up_and_steps
 from visdom_plugin.nerf.volume_packed import composite_packed
 from visdom_plugin.render import Render
@@ -66,9 +66,9 @@ class Ingp:
             c.occupancy_resolution, c.half_side, c.occupancy_alpha / c.step_length, device=device
         )
         if c.drop_unsampled:
-            parts = [
-                self._bound(*spread_rays(views.cameras[i].to(device)), self.hooks) for i in range(len(views))
-            ]
+            # VaxNeRF's novel views do look at what training leaves out, so the grid must not hide it.
+            hooks = [] if c.vd.drop_outside else self.hooks
+            parts = [self._bound(*spread_rays(views.cameras[i].to(device)), hooks) for i in range(len(views))]
             rays = LocalRays(*(torch.cat(x) for x in zip(*parts, strict=True)))
             self.occupancy.restrict(rays.origins, rays.directions, rays.near, rays.far)
         self.metrics: dict[str, float] = {}
@@ -92,9 +92,7 @@ class Ingp:
         rays = self._bound(batch.origins, batch.directions, self.hooks)
         step_length = torch.where(rays.hit, c.step_length, c.missing_step_length)
         shift = torch.rand(n, generator=draw).to(self.device)
-        samples = march(
-            rays.origins, rays.directions, rays.near, rays.far, step_length, shift, self.occupancy
-        )
+        samples = self._march(rays, rays.far, step_length, shift, self.hooks)
         rgb, alpha, _ = self._shade(rays, samples, background)
         target = photograph_on(background, batch, alpha)
         self.metrics = {"psnr": float(-10 * (rgb.detach() - target).square().mean().clamp_min(1e-10).log10())}
@@ -113,7 +111,7 @@ class Ingp:
 
     @torch.no_grad()
     def render(self, camera: Cameras, background: Tensor) -> Render:
-        hooks = self.hooks if self.config.vd.hull_at_inference else []
+        hooks = self._hooks_at_inference()
         background = background.to(self.device)
 
         def render_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -121,7 +119,7 @@ class Ingp:
             far = torch.where(rays.hit, rays.far, rays.near)
             step_length = torch.full_like(far, self.config.step_length)
             shift = torch.zeros_like(far)
-            samples = march(rays.origins, rays.directions, rays.near, far, step_length, shift, self.occupancy)
+            samples = self._march(rays, far, step_length, shift, hooks)
             return self._shade(rays, samples, background.expand(len(far), 3))
 
         return render_image(camera.to(self.device), render_rays, self.frame, RAYS_AT_ONCE)
@@ -141,15 +139,30 @@ class Ingp:
     def export(self, folder: Path) -> list[Path]:
         def density_of(points: Tensor) -> Tensor:
             # What rendering skips is not there.
-            return torch.where(self.occupancy.is_occupied(points.to(self.device)), self._density(points), 0)
+            points = points.to(self.device)
+            there = self.occupancy.is_occupied(points)
+            for hook in _filters(self._hooks_at_inference()):
+                there &= hook.keep(self.frame.to_world(points))
+            return torch.where(there, self._density(points), 0)
 
         mesh = mesh_density(density_of, self._colour, self.frame, self.config.half_side)
         return export_mesh(Path(folder) / "mesh.ply", mesh)
+
+    def _hooks_at_inference(self) -> list[SamplerHook]:
+        return self.hooks if self.config.vd.hull_at_inference else []
 
     def _bound(self, origins: Tensor, directions: Tensor, hooks: Sequence[SamplerHook]) -> LocalRays:
         enter, leave = intersect_cube(self.frame.to_local(origins), directions.float(), self.config.half_side)
         near = enter.clamp_min(self.config.near)
         return bound_rays(origins, directions, near, torch.maximum(leave, near), self.frame, hooks)
+
+    def _march(
+        self, rays: LocalRays, far: Tensor, step_length: Tensor, shift: Tensor, hooks
+    ) -> PackedSamples:
+        samples = march(rays.origins, rays.directions, rays.near, far, step_length, shift, self.occupancy)
+        for hook in _filters(hooks):
+            samples = select(samples, hook.keep(self.frame.to_world(_points(rays, samples))))
+        return samples
 
     def _features(self, points: Tensor) -> tuple[Tensor, Tensor]:
         c = self.config
@@ -171,9 +184,7 @@ class Ingp:
         return encode_harmonics(directions)[..., : self.config.view_degree**2]
 
     def _shade(self, rays: LocalRays, samples: PackedSamples, background: Tensor):
-        middles = (samples.starts + samples.ends) / 2
-        points = rays.origins[samples.ray] + middles[:, None] * rays.directions[samples.ray]
-        density, features = self._features(points)
+        density, features = self._features(_points(rays, samples))
         # Harmonics once per ray, then spread to its samples.
         views = self._encode_views(rays.directions)[samples.ray]
         colours = self.colour_net(torch.cat([features, views], -1)).sigmoid()
@@ -186,3 +197,14 @@ class Ingp:
         wanted = int(rays * self.config.samples_per_step / max(samples, 1))
         # At most doubled: right after the first cullings rays may carry no sample at all.
         self._rays = max(LEAST_RAYS, min(wanted, 2 * rays, self.config.max_rays))
+
+
+def _filters(hooks: Sequence[SamplerHook]) -> list[SamplerHook]:
+    """The hooks that have a say about single samples, too."""
+    return [hook for hook in hooks if getattr(hook, "drop_outside", False)]
+
+
+def _points(rays: LocalRays, samples: PackedSamples) -> Tensor:
+    """(M, 3) where the field is asked: the middles of the intervals, in the field's frame."""
+    middles = (samples.starts + samples.ends) / 2
+    return rays.origins[samples.ray] + middles[:, None] * rays.directions[samples.ray]

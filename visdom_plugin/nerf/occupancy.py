@@ -227,6 +227,14 @@ def march(
     return PackedSamples(torch.from_numpy(offsets), ray, starts, starts + step[ray])
 
 
+def select(samples: PackedSamples, kept: Tensor) -> PackedSamples:
+    """The samples with `kept` (M,) bool; rays may be left without any."""
+    before = torch.cat([samples.ray_offsets.new_zeros(1), kept.long().cumsum(0)])
+    return PackedSamples(
+        before[samples.ray_offsets], samples.ray[kept], samples.starts[kept], samples.ends[kept]
+    )
+
+
 def _march_torch(origins, directions, near, far, step, shift, grid: OccupancyGrid) -> PackedSamples:
     most = int(((far - near) / step).clamp_min(0).max().ceil()) + 1
     index = torch.arange(most, device=origins.device)
