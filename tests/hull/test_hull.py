@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from visdom_plugin.errors import CheckpointError, ConfigError
+from visdom_plugin.errors import CheckpointError, ConfigError, EmptyHullError
 from visdom_plugin.hull.components import choose_pieces, erase_pieces, find_pieces
 from visdom_plugin.hull.hull import Hull, write_whole
 from visdom_plugin.hull.mesh import is_closed, mesh_grid
@@ -81,7 +81,7 @@ def test_contains_is_the_voxel_of_the_point(seed):
     shape = random.integers(1, 9, 3)
     grid = random.random(shape) < 0.5
     low = random.normal(size=3)
-    hull = Hull.from_grid(grid, [low, low + shape * 0.25])
+    hull = Hull(grid, np.stack([low, low + shape * 0.25]))
     points = low + (random.random((7, 50, 3)) * 1.4 - 0.2) * shape * 0.25
     wanted = np.zeros(points.shape[:2], bool)
     for index in np.ndindex(*wanted.shape):
@@ -122,23 +122,63 @@ def test_points_inside_are_uniform_and_repeatable():
 
 
 def test_an_empty_hull_answers():
-    hull = Hull.from_grid(np.zeros((4, 4, 4)), [[0, 0, 0], [1, 1, 1]])
+    hull = Hull(np.zeros((4, 4, 4), bool), np.array([[0.0, 0, 0], [1, 1, 1]]))
     assert hull.volume == 0 and hull.radius == 0 and hull.surface_area == 0 and len(hull.to_mesh()[1]) == 0
     assert hull.sample_points(5).shape == hull.sample_inside(5).shape == (0, 3)
     assert not hull.contains(torch.rand(9, 3)).any() and np.allclose(hull.centre, 0.5)
 
 
-def test_from_grid_takes_numbers_and_refuses_nonsense():
-    values = torch.tensor([[[0.4, 0.6]]])
-    assert Hull.from_grid(values, [[0, 0, 0], [1, 1, 2]]).occupancy.tolist() == [[[False, True]]]
-    for array, bounds in [
-        (np.ones((2, 2)), [[0] * 3, [1] * 3]),
-        (np.ones((2, 2, 2)), [[0] * 3, [0] * 3]),
-        (np.ones((2, 2, 2)), [[0] * 3, [np.nan] * 3]),
-        (np.ones((2, 2, 2)), [0, 1]),
-    ]:
-        with pytest.raises(ConfigError):
-            Hull.from_grid(array, bounds)
+def test_from_grid_takes_numbers_of_any_kind_and_copies_them():
+    box = [[0, 0, 0], [1, 1, 2]]
+    for dtype in (torch.float16, torch.bfloat16, torch.float32, torch.float64):
+        values = torch.tensor([[[0.4, 0.6]]], dtype=dtype, requires_grad=True)
+        assert Hull.from_grid(values, torch.tensor(box)).occupancy.tolist() == [[[False, True]]]
+    corners = [torch.tensor([0.1, 0, 0], dtype=torch.float64), np.array([1, 1, 2])]
+    for dtype in (bool, np.uint8, np.int64):
+        grid = np.array([[[0, 1]]], dtype)
+        hull = Hull.from_grid(grid, corners)
+        grid[:] = 0
+        assert hull.occupancy.tolist() == [[[False, True]]] and hull.bounds[0, 0] == 0.1
+    turned = np.asfortranarray(np.arange(24).reshape(2, 3, 4) > 20)
+    assert np.array_equal(Hull.from_grid(turned, box).occupancy, turned)
+
+
+@pytest.mark.parametrize(
+    ("array", "bounds", "said"),
+    [
+        (np.ones((2, 2)), [[0] * 3, [1] * 3], "not shape"),
+        (np.ones((1, 2, 2, 2)), [[0] * 3, [1] * 3], "not shape"),
+        (np.ones((0, 2, 2)), [[0] * 3, [1] * 3], "not shape"),
+        (np.full((2, 2, 2), "a"), [[0] * 3, [1] * 3], "real numbers"),
+        (np.full((2, 2, 2), np.nan), [[0] * 3, [1] * 3], "8 voxels"),
+        (torch.full((2, 2, 2), torch.inf), [[0] * 3, [1] * 3], "8 voxels"),
+        (np.full((2, 2, 2), 0.3), [[0] * 3, [1] * 3], "0.3"),
+        (np.zeros((2, 2, 2), bool), [[0] * 3, [1] * 3], "no voxel"),
+        (np.ones((2, 2, 2)), [[0] * 3, [0] * 3], "lower < upper"),
+        (np.ones((2, 2, 2)), [[1] * 3, [0] * 3], "lower < upper"),
+        (np.ones((2, 2, 2)), [[0] * 3, [np.nan] * 3], "lower < upper"),
+        (np.ones((2, 2, 2)), [0, 0, 0, 1, 1, 1], "two corners"),
+        (np.ones((2, 2, 2)), [[0, 0], [1, 1, 1]], "two corners"),
+        (np.ones((2, 2, 2)), None, "two corners"),
+    ],
+)
+def test_grids_and_boxes_that_cannot_be_a_hull_are_named(tmp_path, array, bounds, said):
+    with pytest.raises((ConfigError, EmptyHullError), match=said):
+        Hull.from_grid(array, bounds)
+    if isinstance(array, np.ndarray) and said != "two corners":
+        np.savez(tmp_path / "foreign.npz", occupancy=array, bounds=bounds)
+        with pytest.raises((ConfigError, EmptyHullError), match=r"foreign\.npz"):
+            Hull.load(tmp_path / "foreign.npz")
+
+
+def test_load_takes_a_grid_made_elsewhere(tmp_path):
+    grid = np.random.default_rng(0).random((5, 6, 7)).astype(np.float32)
+    box = [[-1, -2, -3], [4, 4, 4]]
+    np.savez_compressed(tmp_path / "foreign.npz", occupancy=grid, bounds=box)
+    assert Hull.load(tmp_path / "foreign.npz") == Hull.from_grid(grid > 0.5, box)
+    np.save(tmp_path / "grid.npy", grid)
+    with pytest.raises(CheckpointError, match="occupancy="):
+        Hull.load(tmp_path / "grid.npy")
 
 
 def test_save_and_load_round_trip(tmp_path):

@@ -41,7 +41,7 @@ def random_hull(random, fill: float) -> Hull:
             < 0.3
         )
     low = random.normal(size=3)
-    return Hull.from_grid(grid, np.stack([low, low + shape * random.choice([0.01, 0.3, 2.0])]))
+    return Hull(grid, np.stack([low, low + shape * random.choice([0.01, 0.3, 2.0])]))
 
 
 def random_rays(random, hull: Hull, n: int):
@@ -145,7 +145,7 @@ def test_rays_without_direction_and_nan_miss():
 
 
 def test_an_empty_hull_is_never_met():
-    hull = Hull.from_grid(np.zeros((5, 6, 7)), [[-1] * 3, [1] * 3])
+    hull = Hull(np.zeros((5, 6, 7), bool), np.array([[-1.0] * 3, [1.0] * 3]))
     origins, directions = torch.randn(50, 3), torch.randn(50, 3)
     assert not cast(hull, origins, directions).hit.any() and not march(hull, origins, directions).hit.any()
 

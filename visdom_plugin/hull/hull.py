@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.errors import CheckpointError, ConfigError
+from visdom_plugin.errors import CheckpointError
+from visdom_plugin.hull.foreign import check_bounds, check_grid
 from visdom_plugin.hull.mesh import mesh_grid
 
 _SCHEMA = 1
@@ -36,27 +37,23 @@ class Hull:
 
     @classmethod
     def from_grid(cls, array, bounds, summary: dict[str, Any] | None = None) -> Hull:
-        """A hull from any occupancy grid.
+        """A hull from any occupancy grid; the array is copied.
 
         Args:
-            array: (X, Y, Z) tensor or array; bool, or numbers of which those above 0.5 are inside.
-            bounds: (2, 3) lower and upper corner, world frame.
+            array: (X, Y, Z) tensor or array; bool, or numbers of which those above 0.5 are inside. Voxel (0, 0, 0)
+                lies at the lower corner.
+            bounds: (2, 3) lower and upper corner of the grid, world frame: its outer faces, not voxel centres.
 
         Raises:
-            ConfigError: for a grid that is not three-dimensional, or bounds without extent.
+            ConfigError: for a grid that is not three-dimensional, holds no voxels or numbers that are not finite;
+                or bounds that are not finite or not in order.
+            EmptyHullError: when no voxel is inside.
         """
-        array = array.detach().cpu().numpy() if isinstance(array, Tensor) else np.asarray(array)
-        bounds = bounds.detach().cpu().numpy() if isinstance(bounds, Tensor) else bounds
-        bounds = np.array(bounds, np.float64)
-        if array.ndim != 3 or array.size == 0:
-            raise ConfigError(f"a hull needs a grid (X, Y, Z), not shape {array.shape}")
-        if bounds.shape != (2, 3) or not np.isfinite(bounds).all() or not (bounds[1] > bounds[0]).all():
-            raise ConfigError(
-                f"bounds {bounds.tolist()} are not two corners with lower < upper",
-                todo="pass ((x, y, z), (x, y, z)) in world units",
-            )
-        occupancy = array if array.dtype == np.bool_ else array > 0.5
-        return cls(np.ascontiguousarray(occupancy), bounds, summary or {})
+        return cls._checked(array, bounds, "Hull.from_grid", summary)
+
+    @classmethod
+    def _checked(cls, array, bounds, where, summary=None) -> Hull:
+        return cls(check_grid(array, where), check_bounds(bounds, where), summary or {})
 
     def __getstate__(self):
         return self.__dict__ | {"_derived": {}}
@@ -235,13 +232,17 @@ class Hull:
 
     @classmethod
     def load(cls, path: str | Path) -> Hull:
-        """Reads what `save` wrote.
+        """Reads what `save` wrote, or a grid made elsewhere: an .npz with the arrays `occupancy` (X, Y, Z) and
+        `bounds` (2, 3), as `from_grid` takes them.
 
         Raises:
             CheckpointError: when the file is missing, damaged or of another kind or version.
+            ConfigError, EmptyHullError: as `from_grid`, for a grid made elsewhere.
         """
         try:
             with np.load(path, allow_pickle=False) as file:
+                if "header" not in file and "bounds" in file:
+                    return cls._checked(file["occupancy"], file["bounds"], path)
                 header = json.loads(file["header"].tobytes())
                 packed = file["occupancy"]
             if header["schema"] != _SCHEMA:
@@ -251,11 +252,13 @@ class Hull:
                     todo="carve the hull again",
                 )
             shape, count = tuple(header["shape"]), int(np.prod(header["shape"]))
-            if len(shape) != 3 or len(packed) != (count + 7) // 8:
+            corners = np.array(header["bounds"], np.float64)
+            if len(shape) != 3 or len(packed) != (count + 7) // 8 or corners.shape != (2, 3):
                 raise ValueError("size of the grid")
             occupancy = np.unpackbits(packed, count=count).view(bool).reshape(shape)
-            return cls.from_grid(occupancy, header["bounds"], header["summary"])
+            return cls(occupancy, corners, header["summary"])
         except (
+            AttributeError,
             OSError,
             ValueError,
             KeyError,
@@ -265,13 +268,12 @@ class Hull:
             RuntimeError,
             zlib.error,
             zipfile.BadZipFile,
-            ConfigError,
         ) as error:
             missing = isinstance(error, FileNotFoundError)
             raise CheckpointError(
                 "there is no such hull file" if missing else "this is not a hull file, or it is damaged",
                 where=path,
-                todo="carve the hull again and save it with Hull.save",
+                todo="carve the hull again and save it with Hull.save, or np.savez(path, occupancy=, bounds=)",
             ) from error
 
     def write_ply(self, path: str | Path) -> None:
