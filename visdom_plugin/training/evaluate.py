@@ -6,7 +6,6 @@ import logging
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,12 +13,17 @@ from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import EmptyHullError
 from visdom_plugin.scene import Views
 from visdom_plugin.training import metrics
-from visdom_plugin.training.pictures import draw_sheet, picture_names, to_bytes, write_png
+from visdom_plugin.training.pictures import (
+    SHEET_ROWS,
+    draw_sheet,
+    picture_names,
+    shown_on_sheet,
+    to_bytes,
+    write_png,
+)
 from visdom_plugin.training.protocols import Method
 
 log = logging.getLogger(__name__)
-
-SHEET_VIEWS = 6
 
 
 def evaluate(
@@ -41,7 +45,7 @@ def evaluate(
     perceptual = metrics.load_lpips()
     rows: dict[str, dict[str, float]] = {}
     columns = []
-    shown = set(np.linspace(0, len(views) - 1, min(SHEET_VIEWS, len(views))).round().astype(int).tolist())
+    shown = shown_on_sheet(len(views))
     files = picture_names(views.names)
     for i, name in enumerate(views.names):
         rgb, alpha = render_on_white(method, views.cameras[i], device)
@@ -58,7 +62,7 @@ def evaluate(
                 grey = to_bytes(alpha[..., None].expand(-1, -1, 3))
                 columns.append((f"{name}  {rows[name]['psnr']:.1f} dB", [truth, to_bytes(rgb), grey]))
     if folder is not None and columns:
-        write_png(folder / "test_sheet.png", draw_sheet(columns, ["truth", "render", "alpha"]))
+        write_png(folder / "test_sheet.png", draw_sheet(columns, SHEET_ROWS))
     return {"test": metrics.mean_over_views(list(rows.values())), "per_view": rows}
 
 

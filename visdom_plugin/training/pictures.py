@@ -14,6 +14,10 @@ from visdom_plugin.training.metrics import quantise
 
 SHEET_WIDTH_PX = 260
 """Width of one picture on the contact sheet."""
+SHEET_VIEWS = 6
+"""Views on the contact sheet, at most."""
+SHEET_ROWS = ("truth", "render", "alpha")
+_SHEET_TOP, _SHEET_GAP = 24, 4
 _SUFFIXES = ("png", "jpg", "jpeg", "tif", "tiff", "webp", "bmp")
 
 
@@ -42,7 +46,12 @@ def write_png(path: Path, image: np.ndarray) -> None:
     write_bytes(path, data.tobytes())
 
 
-def draw_sheet(columns: list[tuple[str, list[np.ndarray]]], rows: list[str]) -> np.ndarray:
+def shown_on_sheet(count: int) -> list[int]:
+    """Positions of the views that the contact sheet shows, of `count` views, in its order from left to right."""
+    return sorted(set(np.linspace(0, count - 1, min(SHEET_VIEWS, count)).round().astype(int).tolist()))
+
+
+def draw_sheet(columns: list[tuple[str, list[np.ndarray]]], rows: Sequence[str]) -> np.ndarray:
     """A labelled table of pictures, (H, W, 3) uint8.
 
     Args:
@@ -51,11 +60,11 @@ def draw_sheet(columns: list[tuple[str, list[np.ndarray]]], rows: list[str]) -> 
     """
     import cv2
 
-    margin, top, gap = max(62, 14 + 8 * max(map(len, rows))), 24, 4
+    margin, top, gap = _sheet_margin(rows), _SHEET_TOP, _SHEET_GAP
     cells = []
     for _, pictures in columns:
         h, w = pictures[0].shape[:2]
-        size = (SHEET_WIDTH_PX, max(1, round(h * SHEET_WIDTH_PX / w)))
+        size = (SHEET_WIDTH_PX, _sheet_height(h, w))
         way = cv2.INTER_AREA if w > SHEET_WIDTH_PX else cv2.INTER_NEAREST
         cells.append([cv2.resize(p, size, interpolation=way) for p in pictures])
     row_height = max(p.shape[0] for column in cells for p in column)
@@ -74,6 +83,28 @@ def draw_sheet(columns: list[tuple[str, list[np.ndarray]]], rows: list[str]) -> 
             y = top + r * (row_height + gap)
             sheet[y : y + picture.shape[0], x : x + SHEET_WIDTH_PX] = picture
     return sheet
+
+
+def cut_sheet(
+    sheet: np.ndarray, column: int, row: int, rows: Sequence[str], size: tuple[int, int]
+) -> np.ndarray:
+    """One picture of a contact sheet as it is there, (h, SHEET_WIDTH_PX, 3) uint8; the inverse of `draw_sheet`.
+
+    Args:
+        rows: names of the sheet's rows.
+        size: (height, width) of the picture before it was put there.
+    """
+    pitch = (sheet.shape[0] - _SHEET_TOP) // len(rows)
+    x, y = _sheet_margin(rows) + column * (SHEET_WIDTH_PX + _SHEET_GAP), _SHEET_TOP + row * pitch
+    return sheet[y : y + _sheet_height(*size), x : x + SHEET_WIDTH_PX]
+
+
+def _sheet_margin(rows: Sequence[str]) -> int:
+    return max(62, 14 + 8 * max(map(len, rows)))
+
+
+def _sheet_height(height: int, width: int) -> int:
+    return max(1, round(height * SHEET_WIDTH_PX / width))
 
 
 def write_video(path: Path, frames: list[np.ndarray], fps: int = 30) -> str:
