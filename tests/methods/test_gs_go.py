@@ -10,7 +10,9 @@ from datamodules.synthetic import SyntheticConfig, make_scene
 from method_configs.gs_go import PRESETS, QUICK
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.methods.gs_go import GsGo, mean_masked_colour, scene_extent
+from visdom_plugin.methods.gaussian_set import scene_extent
+from visdom_plugin.methods.gs_go import GsGo
+from visdom_plugin.methods.initial_cloud import mean_masked_colour
 
 CPU = torch.device("cpu")
 SMALL = replace(
@@ -102,7 +104,7 @@ class Bystander:
 def test_a_hook_that_adds_nothing_changes_nothing(scene, hull):
     config = replace(SMALL, vd=RegularizerConfig())
     plain = start(scene, hull, config, hooks=[])
-    p = plain.optimiser.parameters
+    p = plain.splats.optimiser.parameters
     xyz, rgb = p["means"].detach().clone(), (p["sh_dc"].detach()[:, 0] * 0.28209479177387814 + 0.5)
     twin = start(scene, hull, config, hooks=[Bystander((xyz, rgb))])
     twin.load_state_dict({k: v.clone() for k, v in plain.state_dict().items()})
@@ -120,11 +122,11 @@ def test_two_hooks_are_a_list_and_removal_is_carried_out(scene, hull):
     points = (torch.zeros(0, 3), torch.zeros(0, 3))
     method = start(scene, hull, hooks=[SMALL.vd.build(hull, scene.train), Remover(points)])
     advance(method, scene, range(3))
-    assert len(method.optimiser) == 600 - 15
+    assert len(method.splats) == 600 - 15
 
 
 def test_seeds_differ_and_repeat(scene, hull):
-    means = [start(scene, hull, seed=s).optimiser.parameters["means"] for s in (0, 0, 1)]
+    means = [start(scene, hull, seed=s).splats.optimiser.parameters["means"] for s in (0, 0, 1)]
     assert torch.equal(means[0], means[1]) and not torch.equal(means[0], means[2])
 
 
