@@ -1,14 +1,25 @@
-"""Registration: by entry points alone, all or nothing per package, and one bad package harms nobody else."""
+"""Registration: by one door, all or nothing per package, and one bad package harms nobody else."""
 
 from __future__ import annotations
 
+import copy
 import logging
+import os
+import pickle
+import re
+import subprocess
+import sys
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import EntryPoint, entry_points
 
 import pytest
 
+from visdom_plugin.cli.doctor import examine
 from visdom_plugin.errors import ConfigError, PluginError
-from visdom_plugin.registry import GROUP, Preset, Registry, discover
+from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.registry import GROUP, MethodSpec, Preset, Registry, discover
+from visdom_plugin.training.settings import as_plain, from_plain
 
 
 def _preset(name: str) -> Preset:
@@ -51,7 +62,7 @@ def test_a_broken_package_is_skipped_whole_with_one_warning_naming_it(value, rea
         registry = discover(points)
     assert "listed" in registry.presets and "unique" not in registry.presets
     warnings = [r.getMessage() for r in caplog.records]
-    assert len(warnings) == 1 and reason in warnings[0] and len(registry.broken) == 1
+    assert len(warnings) == 1 and reason in warnings[0] and len(registry.skipped) == 1
 
 
 def test_a_name_cannot_be_taken_twice_not_even_as_an_alias():
@@ -88,3 +99,159 @@ def test_the_built_in_methods_come_by_the_entry_point():
         if origin == "visdom-plugin":
             preset = found.presets[name]
             assert preset.load() and preset.description and type(preset.quick) is type(preset.full)
+
+
+@dataclass
+class Plain:
+    """A stranger's settings.
+
+    Attributes:
+        width: of the network.
+    """
+
+    width: int
+    steps: int = 7
+
+
+@dataclass(frozen=True)
+class Frozen:
+    steps: int = 7
+    mask_weight: float = 0.25
+    """Its own."""
+
+
+TARGET = "tests.training.fake:FakeMethod"
+SPEC = MethodSpec("mine", TARGET, Plain(3), full=Plain(64, steps=900), hook="sampler", aliases=("my",))
+
+
+@pytest.mark.parametrize("hook", ["sampler", "gaussian"])
+@pytest.mark.parametrize("config", [Plain(3), Frozen()], ids=["plain", "frozen"])
+def test_a_method_that_says_its_hook_gets_all_variants_with_one_class_of_settings(hook, config):
+    spec = MethodSpec("m", TARGET, config, hook=hook)
+    bare, mask, vd = (spec.presets()[f"m{suffix}"].quick for suffix in ("", "+mask", "+vd"))
+    assert type(bare) is type(mask) is type(vd) and isinstance(bare, type(config))
+    for f in fields(config):
+        if f.name != "mask_weight":
+            assert getattr(bare, f.name) == getattr(vd, f.name) == getattr(config, f.name)
+    assert bare.mask_weight == getattr(config, "mask_weight", 0) and mask.mask_weight == vd.mask_weight == 0.1
+    assert bare.hull is mask.hull is None and isinstance(vd.hull, VisibleDomain)
+    settings = {"sampler": SamplerConfig, "gaussian": RegularizerConfig}[hook]
+    assert bare.vd == mask.vd == settings() and vd.vd == settings(enabled=True)
+    assert {p.hook for p in spec.presets().values()} == {hook}
+
+
+def test_settings_with_fields_added_are_data_as_any_other():
+    bare, vd = (SPEC.presets()[name].full for name in ("mine", "mine+vd"))
+    for twin in (
+        copy.deepcopy(vd),
+        pickle.loads(pickle.dumps(vd)),
+        from_plain(vd, as_plain(vd), "here"),
+    ):
+        assert twin == vd and type(twin) is type(vd) and twin != bare
+    assert MethodSpec("other", TARGET, Plain(3), hook="sampler").presets()["other"].quick == replace(
+        bare, width=3, steps=7
+    )
+
+
+def test_a_method_without_a_hook_stays_as_it_is():
+    (preset,) = MethodSpec("m", TARGET, Plain(3)).presets().values()
+    assert type(preset.quick) is Plain and preset.full is preset.quick and preset.hook is None
+
+
+def test_variants_may_change_more_and_full_keeps_its_own():
+    presets = replace(
+        SPEC, variants={"vd": {"width": 5, "vd": SamplerConfig(True, missing="skip")}}
+    ).presets()
+    assert presets["mine+vd"].quick.width == presets["mine+vd"].full.width == 5
+    assert presets["mine+vd"].quick.vd.missing == "skip" and presets["mine+mask"].quick.width == 3
+    assert presets["mine+vd"].full.steps == 900 and presets["my+vd"] is presets["mine+vd"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"name": "a+vd"}, "'a+vd' is no name"),
+        ({"name": 3}, "3 is no name"),
+        ({"aliases": ("a b",)}, "'a b' is no name"),
+        ({"target": "module.Class"}, "target is 'module.Class'"),
+        ({"target": Plain}, "target is"),
+        ({"quick": Plain}, "quick is the class Plain"),
+        ({"full": {"steps": 3}}, "full is dict"),
+        ({"full": Frozen()}, "different classes"),
+        ({"hook": "samplr"}, "no hook 'samplr'"),
+        ({"variants": {"+vd": {}}}, "no variant '+vd'"),
+        ({"variants": {"vd": {"widht": 3}}}, "sets 'widht'"),
+        ({"hook": None, "variants": {"vd": {}}}, "no variant 'vd'"),
+    ],
+)
+def test_a_spec_that_cannot_be_right_says_what_and_what_to_do(changes, what):
+    with pytest.raises(PluginError, match=re.escape(what)) as caught:
+        replace(SPEC, **changes)
+    assert caught.value.todo and "MethodSpec" in caught.value.where
+
+
+def test_the_variable_names_code_that_is_not_installed_and_how_it_is_called(caplog):
+    found = discover([], f" one={__name__}:SPEC, two = {__name__}:SPEC,three={__name__}:LIST,")
+    # Both are called "my", too.
+    assert set(found.presets) == {"one", "one+mask", "one+vd", "listed"} and len(found.skipped) == 1
+    found = discover([], f"one={__name__}:LIST,{__name__}:SPEC,x={__name__},y=no_such_module_:X")
+    assert set(found.presets) == {"listed"} and found.origins["listed"] == "VISDOM_METHODS"
+    assert ["names no object" in s.reason for s in found.skipped] == [True, True, False]
+    assert "PYTHONPATH" in found.skipped[2].todo
+    with pytest.raises(ConfigError, match="skipped"):
+        found.find("y")
+
+
+def test_the_variable_cannot_take_a_name_either():
+    found = discover([_point("a", f"{__name__}:ALIASED")], f"good={__name__}:SPEC")
+    assert found.find("good") is A and "already has one" in found.skipped[0].reason
+
+
+STRANGER = """
+import {heavy}
+from dataclasses import dataclass
+from visdom_plugin.registry import MethodSpec
+@dataclass
+class Config:
+    steps: int = 3
+SPEC = MethodSpec("strange", "heavy_method:Method", Config(), hook="sampler", description="A strange one")
+"""
+
+
+def _command(tmp_path, *words, **variables):
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)} | variables
+    code = "import sys; from visdom_plugin.cli.methods import main; sys.exit(main(sys.argv[1:]))"
+    run = [sys.executable, "-c", code, *words]
+    return subprocess.run(run, env=environment, capture_output=True, text=True, timeout=300)
+
+
+def test_the_list_imports_no_method_and_the_doctor_tells_what_is_wrong_with_each(tmp_path):
+    (tmp_path / "heavy_method.py").write_text("raise RuntimeError('loaded')\n")
+    (tmp_path / "light.py").write_text(STRANGER.format(heavy="json"))
+    (tmp_path / "slow.py").write_text(STRANGER.format(heavy="torch"))
+    (tmp_path / "exits.py").write_text("import sys\nsys.exit('no licence')\n")
+    variable = "light=light:SPEC,slow=slow:SPEC,gone=exits:SPEC"
+    listed = _command(tmp_path, VISDOM_METHODS=variable)
+    assert listed.returncode == 0, listed.stderr
+    for name in ("method:light ", "method:light+vd ", "method:slow+mask ", "method:3dgs-go "):
+        assert name in listed.stdout
+    assert listed.stderr.count("\n") == 1 and "no licence" in listed.stderr
+    doctor = _command(tmp_path, "--doctor", VISDOM_METHODS=variable).stdout
+    assert "RuntimeError: loaded" in doctor and "method light cannot be loaded" in doctor
+    assert "VISDOM_METHODS (slow:SPEC) imports torch" in doctor and "(light:SPEC) imports" not in doctor
+    assert "(exits:SPEC) was skipped" in doctor and "sys.exit('no licence')" in doctor
+    assert "importlib" not in doctor
+
+
+def test_the_doctor_looks_for_slurm_and_other_hosts(tmp_path, monkeypatch):
+    for name in ("sbatch", "sinfo"):
+        (tmp_path / name).write_text("#!/bin/sh\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    lines = examine(Registry())
+    assert f"slurm: sbatch {tmp_path}/sbatch, sinfo {tmp_path}/sinfo" in lines
+    monkeypatch.setenv("PATH", "")
+    lines = examine(Registry())
+    assert any(line.startswith("slurm: not found") for line in lines)
+    for name in ("torch", "cuda", "gsplat", "opencv", "submitit", "nerfstudio", "nerfacc"):
+        assert sum(line.startswith(f"{name}: ") for line in lines) == 1, name

@@ -142,6 +142,7 @@ def test_methods_lists_names_descriptions_and_aliases(fakes, capsys):
 
 def test_the_doctor_names_what_is_there_and_warns_of_two_opencvs(fakes, capsys, monkeypatch):
     from visdom_plugin.cli import doctor
+    from visdom_plugin.registry import Skipped
 
     assert methods.main(["--doctor"]) == 0
     out = capsys.readouterr().out
@@ -156,11 +157,12 @@ def test_the_doctor_names_what_is_there_and_warns_of_two_opencvs(fakes, capsys, 
     ):
         assert name in out
     known = fake.fake_registry()
-    known.broken["strange (x:y)"] = "ImportError: no"
+    known.skipped.append(Skipped("strange", "1.2", "x:y", "ImportError: no", "mend it", "Traceback"))
     monkeypatch.setattr(doctor, "opencv_distributions", lambda: [("opencv-python", "4"), ("opencv-x", "5")])
     warnings = [line for line in doctor.examine(known) if line.startswith("warning")]
     assert (
-        "pip uninstall opencv-python opencv-x" in warnings[0] and "strange (x:y) was skipped" in warnings[1]
+        "pip uninstall opencv-python opencv-x" in warnings[0]
+        and "strange 1.2 (x:y) was skipped" in warnings[1]
     )
 
 

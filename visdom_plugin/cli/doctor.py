@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 from importlib.metadata import PackageNotFoundError, distributions, version
 from importlib.util import find_spec
 
-from visdom_plugin.registry import Registry
+from visdom_plugin.errors import PluginError
+from visdom_plugin.registry import Registry, Skipped, tell
 
 
 def examine(known: Registry) -> list[str]:
@@ -20,6 +22,9 @@ def examine(known: Registry) -> list[str]:
         ("gsplat", "Gaussians on CUDA: pip install 'visdom-plugin[cuda]'"),
         ("lpips", "LPIPS metric: pip install 'visdom-plugin[lpips]'"),
         ("av", "H.264 video: pip install 'visdom-plugin[video]'"),
+        ("nerfstudio", "ns-train with the visible domain: pip install 'visdom-plugin[nerfstudio]'"),
+        ("nerfacc", "its rays and occupancy grids: pip install nerfacc"),
+        ("submitit", "jobs on a Slurm cluster: pip install submitit"),
     ):
         found = _version(name)
         lines.append(f"{name}: {found}" if found != "not found" else f"{name}: not found ({why})")
@@ -31,10 +36,56 @@ def examine(known: Registry) -> list[str]:
             f"keep one: pip uninstall {' '.join(n for n, _ in opencv)} "
             "&& pip install opencv-contrib-python-headless"
         )
+    lines.append(_slurm())
     for name, origin in known.origins.items():
-        lines.append(f"method {name}: from {origin}, {known.presets[name].target}")
-    lines += [f"warning: {origin} was skipped: {reason}" for origin, reason in known.broken.items()]
+        release = _version(origin)
+        release = f" {release}" if release != "not found" else ""
+        lines.append(f"method {name}: from {origin}{release}, {known.presets[name].target}")
+    lines += _unusable(known)
+    for origin, (seconds, heavy) in known.slow.items():
+        lines.append(
+            f"warning: to tell its methods' names, {origin} imports {', '.join(heavy)} ({seconds:.1f} s of every "
+            "--help); its MethodSpec belongs into a module that imports nothing heavy"
+        )
+    for skipped in known.skipped:
+        lines += _story(skipped)
     return lines
+
+
+def _slurm() -> str:
+    found = {name: shutil.which(name) for name in ("sbatch", "sinfo")}
+    if not any(found.values()):
+        return "slurm: not found (no sbatch, no sinfo)"
+    return "slurm: " + ", ".join(f"{name} {path or 'not found'}" for name, path in found.items())
+
+
+def _unusable(known: Registry) -> list[str]:
+    """Methods whose class cannot be imported, each class once."""
+    lines, seen = [], set()
+    for name, preset in known.presets.items():
+        if preset.target in seen:
+            continue
+        seen.add(preset.target)
+        try:
+            preset.load()
+        except PluginError as error:
+            lines.append(f"warning: {error}")
+            lines += _indent(tell(error.__cause__)) if error.__cause__ is not None else []
+            lines.append(f"  offered by: {known.origins[name]}")
+    return lines
+
+
+def _story(skipped: Skipped) -> list[str]:
+    release = f" {skipped.version}" if skipped.version else ""
+    return [
+        f"warning: {skipped.origin}{release} ({skipped.value}) was skipped: {skipped.reason}",
+        *_indent(skipped.story),
+        f"  what to do: {skipped.todo}",
+    ]
+
+
+def _indent(text: str) -> list[str]:
+    return [f"  | {line}" for line in text.splitlines()]
 
 
 def opencv_distributions() -> list[tuple[str, str]]:
