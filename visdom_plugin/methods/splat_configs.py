@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.demands import demand
@@ -159,7 +158,7 @@ class CorgsConfig(GaussianSetConfig):
     """The same in units of the scene; wins over the fraction. The authors: 20 for mip-NeRF 360, 10 for DTU, 5 for
     LLFF, in the units COLMAP happened to choose."""
 
-    hull: VisibleDomain | None = field(default_factory=lambda: VisibleDomain(kind="released-go"))
+    hull: VisibleDomain = field(default_factory=lambda: VisibleDomain(kind="released-go"))
     """Where the Gaussians start, unless that is random."""
     vd: RegularizerConfig = field(default_factory=RegularizerConfig)
     """The visible-domain hook, called once for each set."""
@@ -184,9 +183,3 @@ class CorgsConfig(GaussianSetConfig):
                 "co_prune_world": (world is None or world > 0, "a positive number, or None"),
             },
         )
-        if self.hull is None and (self.vd.enabled or self.initial_cloud == "hull"):
-            raise ConfigError(
-                "the Gaussians are to start in a hull, but there is none",
-                where=type(self).__name__,
-                todo="start from a preset of corgs-lite, which has one, or with --method.initial-cloud random",
-            )
