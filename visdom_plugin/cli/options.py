@@ -5,7 +5,7 @@ Later wins: preset (by budget), then the file of --config, then the command line
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
 from dataclasses import field as dataclass_field
 from pathlib import Path
@@ -101,8 +101,15 @@ class Request:
     """One line on which budget was chosen and why."""
 
 
-def parse(argv: Sequence[str], prog: str = "visdom-train") -> Request:
+def parse(
+    argv: Sequence[str],
+    prog: str = "visdom-train",
+    find: Callable[[str], registry.Preset] = registry.find,
+) -> Request:
     """Reads the command line.
+
+    Args:
+        find: a method's name to its preset.
 
     Raises:
         ConfigError: for an unknown or missing method, and for everything wrong in the file.
@@ -116,15 +123,15 @@ def parse(argv: Sequence[str], prog: str = "visdom-train") -> Request:
     name = words[0][len(WORD) :] if words else file.get("method")
     if name is None:
         _without_method(rest, prog)
-    preset = registry.find(str(name))
-    if words and "method" in file and registry.find(str(file["method"])) != preset:
+    preset = find(str(name))
+    if words and "method" in file and find(str(file["method"])) != preset:
         raise ConfigError(
             f"the file is for method:{file['method']}, the command line says {words[0]}",
             where=where,
             todo=f"make one for it: {prog} {words[0]} --show-config > FILE",
         )
     asking_help = any(a in ("-h", "--help") for a in rest)
-    budget, note = _choose_budget(rest, file, ask_torch=not asking_help)
+    budget, note = choose_budget(rest, file, ask_torch=not asking_help)
     config = getattr(preset, budget)
     common = Common()
     if file:
@@ -200,7 +207,11 @@ def _scan(argv: Sequence[str], option: str) -> str | None:
     return value
 
 
-def _choose_budget(rest: Sequence[str], file: dict[str, Any], ask_torch: bool) -> tuple[str, str]:
+def choose_budget(rest: Sequence[str], file: dict[str, Any], ask_torch: bool = True) -> tuple[str, str]:
+    """ "quick" or "full", and why, from the command line's words and a config file's entries.
+
+    Without `ask_torch`, a driver is taken for a CUDA device.
+    """
     budget = _scan(rest, "budget") or file.get("budget", "auto")
     if budget in ("quick", "full"):
         return budget, f"budget {budget}"

@@ -40,7 +40,7 @@ def evaluate(
         folder: `<folder>/test/<name>.png` and `<folder>/test_sheet.png` are written.
 
     Returns:
-        {"test": means, "per_view": {name: metrics}}; see `metrics.compare`.
+        {"test": means, "per_view": {name: metrics}, "protocol": metrics.PROTOCOL}; see `metrics.compare`.
     """
     perceptual = metrics.load_lpips()
     rows: dict[str, dict[str, float]] = {}
@@ -63,7 +63,8 @@ def evaluate(
                 columns.append((f"{name}  {rows[name]['psnr']:.1f} dB", [truth, to_bytes(rgb), grey]))
     if folder is not None and columns:
         write_png(folder / "test_sheet.png", draw_sheet(columns, SHEET_ROWS))
-    return {"test": metrics.mean_over_views(list(rows.values())), "per_view": rows}
+    means = metrics.mean_over_views(list(rows.values()))
+    return {"test": means, "per_view": rows, "protocol": dict(metrics.PROTOCOL)}
 
 
 def render_on_white(method: Method, camera: Cameras, device: torch.device) -> tuple[Tensor, Tensor]:

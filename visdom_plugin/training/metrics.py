@@ -17,6 +17,9 @@ from torch import Tensor
 log = logging.getLogger(__name__)
 
 SILHOUETTE_ALPHA = 0.5
+PROTOCOL = {"background": "white", "definition": 1}
+"""Noted beside the numbers. `definition` goes up with every change of what a number here means, so that tables do
+not set the old and the new side by side."""
 NAMES = (
     "psnr",
     "psnr_per_channel",

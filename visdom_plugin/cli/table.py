@@ -1,0 +1,262 @@
+"""visdom-table: a table of methods, scenes, views and seeds from a file, with every run behind it."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from visdom_plugin.cli.errors import run
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.tables.spec import Column, TableSpec, list_editions, list_tables, load_table
+
+MODULES = {"train": "visdom_plugin.cli.train", "hull": "visdom_plugin.cli.measure_hull"}
+"""What does a job of each kind of table."""
+FAILURES = 1
+"""Exit status of a table with failed runs."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Run a table: every row (method) on every scene and number of views of every column, once per seed.
+
+    Finished runs are reused, interrupted ones go on, failed ones keep their error in the table and do not stop the
+    rest. Writes table.md, .csv, .tex and .html whenever a run ends. Exits with 1 when runs failed.
+    """
+
+    table: tyro.conf.Positional[str | None] = None
+    """Name of a shipped table or a YAML file, with `:EDITION` where wanted; without it, the shipped ones are
+    listed."""
+    edition: str | None = None
+    """Edition of the table, e.g. smoke."""
+    out: Path | None = None
+    """Folder of the table; by default tables/<name>, or tables/<name>-<edition>."""
+    runs: Path | None = None
+    """Folder of run directories; by default `runs` in the table's folder. Tables with the same one share
+    their runs."""
+    root: tuple[str, ...] = ()
+    """Where data lie, as NAME=DIR for each root the table names; or set VISDOM_ROOT_<NAME>."""
+    data: Path | None = None
+    """Run the rows on this scene in place of the table's columns."""
+    views: tuple[int, ...] = ()
+    """Numbers of training views in place of the table's."""
+    downscale: float | None = None
+    """In place of the table's."""
+    seeds: tuple[int, ...] = ()
+    """In place of the table's."""
+    only: tuple[str, ...] = ()
+    """Labels of the rows to run; the others show what there is."""
+    budget: Literal["auto", "quick", "full"] | None = None
+    """In place of the table's."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; auto takes CUDA where there is one."""
+    executor: Literal["process", "local", "slurm"] | None = None
+    """This process; `--workers` processes of this machine (the default with --workers); or a Slurm cluster."""
+    workers: int | None = None
+    """Runs at a time on this machine; its cores are divided among them."""
+    slurm: Path | None = None
+    """YAML file of Slurm's resources; its entries win over the table's `slurm:`."""
+    retry: bool = False
+    """Try failed runs again."""
+    dry_run: bool = False
+    """List the runs and what is there already, and stop."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return run(_main, argv)
+
+
+def _main(argv: Sequence[str]) -> int:
+    options = tyro.cli(Options, args=list(argv), prog="visdom-table")
+    if options.table is None:
+        for name, path in list_tables().items():
+            spec, editions = load_table(name), list_editions(path)
+            also = f"  (editions: {', '.join(editions)})" if editions else ""
+            sys.stdout.write(f"{name:<20} {spec.title}{also}\n")
+        return 0
+    spec = change_spec(load_table(options.table, options.edition), options)
+    return run_spec(spec, options)
+
+
+def run_spec(spec: TableSpec, options: Options) -> int:
+    """Runs a table as the options say, and returns the exit status."""
+    from visdom_plugin.tables.driver import gather, look, run_plan
+    from visdom_plugin.tables.jobs import plan
+    from visdom_plugin.tables.overview import Overview
+
+    folder = options.out or Path("tables") / "-".join(filter(None, (spec.name, spec.edition)))
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError("the table's folder is a file", where=folder, todo="choose another --out")
+    labels = [row.label for row in spec.rows]
+    for label in options.only:
+        if label not in labels:
+            raise ConfigError(f"there is no row {label!r}", where="--only", todo=f"rows: {', '.join(labels)}")
+    made = plan(spec, options.runs or folder / "runs", make_workshop(options), _read_roots(options))
+    if options.dry_run:
+        sys.stdout.write("\n".join(describe_plan(made)) + "\n")
+        return 0
+    overview = Overview(quiet=options.quiet, workers=options.workers or 1)
+    results = run_plan(
+        made,
+        _make_executor(spec, options, folder, overview.tick),
+        lambda results: write_table(results, folder),
+        retry=options.retry,
+        only=[labels.index(label) for label in options.only] or None,
+        overview=overview,
+    )
+    failed = sum(outcome.status == "failed" for outcome in gather(made, look(made)).outcomes.values())
+    if not options.quiet:
+        from visdom_plugin.cli.report import say
+
+        markdown = folder / "table.md"
+        if markdown.exists():
+            sys.stdout.write(markdown.read_text(encoding="utf-8"))
+        if failed:
+            say(
+                f"{failed} of {len(results.outcomes)} runs failed; the same command with --retry tries them again"
+            )
+        for path in sorted(folder.glob("table.*")):
+            say(f"written: {path}")
+    return FAILURES if failed else 0
+
+
+def change_spec(spec: TableSpec, options: Options) -> TableSpec:
+    """The table with what the command line puts in its place."""
+    columns = spec.columns
+    if options.data is not None:
+        if not options.data.expanduser().is_dir():
+            raise ConfigError(f"there is no folder {options.data}", where="--data")
+        views = options.views or columns[0].views
+        columns = (Column(options.data.resolve().name, "data", (".",), views),)
+    if options.views:
+        columns = tuple(replace(column, views=options.views) for column in columns)
+    if options.downscale is not None:
+        columns = tuple(replace(column, downscale=options.downscale) for column in columns)
+    return replace(
+        spec, columns=columns, seeds=options.seeds or spec.seeds, budget=options.budget or spec.budget
+    )
+
+
+def make_workshop(options: Options) -> Any:
+    """What the tables room needs of registry and data modules."""
+    from visdom_plugin.cli.options import Common
+    from visdom_plugin.tables.jobs import Workshop
+
+    return Workshop(
+        resolve=lambda kind, method, budget: _resolve(kind, method, budget, options),
+        modules=MODULES,
+        built_in_hash=hash_built_in,
+        reading=Common(),
+        device=options.device,
+    )
+
+
+def _resolve(kind: str, method: str, budget: str, options: Options) -> Any:
+    from visdom_plugin import registry
+    from visdom_plugin.cli.options import choose_budget
+    from visdom_plugin.hull.domain import VisibleDomain
+    from visdom_plugin.tables.jobs import Resolved
+
+    if kind == "hull":
+        return Resolved("hull", "full", VisibleDomain()) if method == "hull" else None
+    if budget == "auto" and options.executor == "slurm" and options.device == "auto":
+        raise ConfigError(
+            "budget auto cannot be known before a job stands on its node",
+            todo="--budget quick or full, or --device cpu or cuda",
+        )
+    budget, _ = choose_budget([f"--budget={budget}", f"--device={options.device}"], {})
+    try:
+        preset = registry.find(method)
+    except ConfigError as error:
+        if not registry.installed().presets:
+            raise
+        import logging
+
+        logging.getLogger(__name__).warning("not available: %s", error.what)
+        return None
+    return Resolved(preset.name, budget, getattr(preset, budget))
+
+
+def hash_built_in() -> str:
+    """A hash of the code that draws the built-in scene."""
+    import datamodules
+
+    digest = hashlib.sha256()
+    for path in sorted(Path(datamodules.__file__).parent.glob("synthetic*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def write_table(results: Any, folder: Path) -> list[Path]:
+    """Writes table.{md,csv,tex,html}."""
+    from visdom_plugin.tables.write import write_all
+
+    return write_all(results, folder)
+
+
+def describe_plan(made: Any) -> list[str]:
+    """One line per job: what would become of it."""
+    from visdom_plugin.tables.driver import gather, look
+    from visdom_plugin.tables.state import is_held, read_step
+
+    lines, seen = [], set()
+    for job, outcome in gather(made, look(made)).outcomes.items():
+        word = {"finished": "reuse", "waiting": "run"}.get(outcome.status, outcome.status)
+        if job.run_dir is not None:
+            if job.run_dir in seen:
+                word = "shared"
+            elif outcome.status == "waiting" and is_held(job.run_dir):
+                word = "running"
+            elif outcome.status == "waiting" and (step := read_step(job.run_dir)):
+                word = f"resume from {step}"
+            seen.add(job.run_dir)
+        row, column = made.spec.rows[job.row], made.spec.columns[job.column]
+        where = "" if job.run_dir is None else f"  {job.run_dir}"
+        lines.append(
+            f"{word:<16} {row.label} | {column.label} | {job.scene} | {job.views} | {job.seed}{where}"
+        )
+    todo = len(made.tasks) - sum(o.status == "finished" for o in look(made).values())
+    return [*lines, f"{len(lines)} jobs, {len(made.tasks)} runs, {todo} of them not finished"]
+
+
+def _read_roots(options: Options) -> dict[str, Path]:
+    roots = {}
+    for text in options.root:
+        name, equals, folder = text.partition("=")
+        if not (name and equals and folder):
+            raise ConfigError(f"--root {text} is not NAME=DIR", todo="e.g. --root mip360=/data/mip360")
+        roots[name] = Path(folder)
+    if options.data is not None:
+        roots["data"] = options.data
+    return roots
+
+
+def _make_executor(spec: TableSpec, options: Options, folder: Path, tick: Any) -> Any:
+    from visdom_plugin.tables.executors import Here, Local
+
+    kind = options.executor or ("local" if options.workers else "process")
+    if options.workers is not None and (options.workers < 1 or kind != "local"):
+        raise ConfigError(
+            f"--workers {options.workers} does not go with the executor {kind!r}"
+            if kind != "local"
+            else f"--workers is {options.workers}; it must be 1 or more"
+        )
+    if kind == "process":
+        return Here(tick)
+    if kind == "local":
+        return Local(options.workers or 1)
+    from visdom_plugin.tables.slurm import Slurm, read_config
+
+    return Slurm(read_config(spec, options.slurm), folder)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
