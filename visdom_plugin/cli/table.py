@@ -162,11 +162,11 @@ def make_workshop(options: Options) -> Any:
 def _resolve(kind: str, method: str, budget: str, options: Options) -> Any:
     from visdom_plugin import registry
     from visdom_plugin.cli.options import choose_budget
-    from visdom_plugin.hull.domain import VisibleDomain
     from visdom_plugin.tables.jobs import Resolved
+    from visdom_plugin.training.hull_settings import HullRunConfig
 
     if kind == "hull":
-        return Resolved("hull", "full", VisibleDomain()) if method == "hull" else None
+        return Resolved("hull", "full", HullRunConfig()) if method == "hull" else None
     if budget == "auto" and options.executor == "slurm" and options.device == "auto":
         raise ConfigError(
             "budget auto cannot be known before a job stands on its node",
