@@ -32,6 +32,9 @@ def die_with(parent: int) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; the exit status is that of the module's `main`."""
     words = list(sys.argv[1:] if argv is None else argv)
+    if hasattr(signal, "SIGUSR2"):
+        # A cluster announces the time limit with it.
+        signal.signal(signal.SIGUSR2, lambda number, frame: signal.raise_signal(signal.SIGTERM))
     if words[0] == "--parent":
         die_with(int(words[1]))
         words = words[2:]

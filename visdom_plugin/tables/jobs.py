@@ -178,9 +178,6 @@ def hash_folder(folder: Path) -> str:
 
 def _resolve(spec: TableSpec, row: Row, workshop: Workshop) -> Resolved | None:
     where = f"row {row.label!r} of {spec.source}"
-    found = workshop.resolve(spec.kind, row.method, row.budget or spec.budget)
-    if found is None:
-        return None
     nested: dict[str, Any] = {}
     for path, value in row.settings.items():
         *parents, last = path.split(".")
@@ -191,6 +188,9 @@ def _resolve(spec: TableSpec, row: Row, workshop: Workshop) -> Resolved | None:
                 raise ConfigError(f"settings name both {parent!r} and {path!r}", where=where)
         inner[last] = value
     try:
+        found = workshop.resolve(spec.kind, row.method, row.budget or spec.budget)
+        if found is None:
+            return None
         return replace(found, config=from_plain(found.config, nested, where))
     except ConfigError as error:
         if error.where == where:
