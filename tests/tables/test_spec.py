@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import pytest
+import yaml
+
+from tests.tables.matrix import table
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.tables.spec import Column, load_table, parse_table
+
+CONTENT = {
+    "title": "Small",
+    "seeds": [0, 1],
+    "settings": {"steps": 5, "hull": {"k": 2}},
+    "rows": [
+        {"label": "One", "method": "one", "settings": {"hull.k": 4}},
+        {"label": "Two", "method": "two", "paper": {"method": "Two", "variant": "vd"}},
+    ],
+    "columns": [{"label": "real", "root": "mip", "scenes": ["kitchen", "bonsai"], "views": [4, 6]}],
+    "editions": {
+        "smoke": {"seeds": 3, "columns": [{"label": "drawn"}], "rows": {"Two": {"settings": {"steps": 1}}}},
+        "half": {"rows": {"One": None}, "settings": {"hull": {"k": 7}}},
+    },
+}
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text(yaml.safe_dump(CONTENT, sort_keys=False))
+    return path
+
+
+def test_a_rows_own_settings_win_over_the_tables_and_nesting_is_the_same_as_dots(file):
+    spec = load_table(file)
+    assert spec.rows[0].settings == {"steps": 5, "hull.k": 4}
+    assert spec.rows[1].settings == {"steps": 5, "hull.k": 2}
+    assert (spec.name, spec.columns[0].scenes, spec.columns[0].views) == (
+        "small",
+        ("kitchen", "bonsai"),
+        (4, 6),
+    )
+
+
+def test_an_edition_is_the_table_with_its_entries_put_in(file):
+    smoke = load_table(f"{file}:smoke")
+    assert smoke == load_table(file, "smoke")
+    assert (smoke.seeds, smoke.columns, smoke.edition) == ((3,), (Column("drawn"),), "smoke")
+    assert smoke.rows[1].settings == {"steps": 1, "hull.k": 2} and smoke.rows[0] == load_table(file).rows[0]
+    half = load_table(file, "half")
+    assert [row.label for row in half.rows] == ["Two"] and half.rows[0].settings["hull.k"] == 7
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"mtrics": ["psnr"]}, "did you mean 'metrics'"),
+        ({"rows": [{"label": "a", "method": "b", "settngs": {}}]}, "did you mean 'settings'"),
+        ({"columns": [{"label": "a", "vews": 4}]}, "did you mean 'views'"),
+        ({"columns": [{"label": "a", "views": ["four"]}]}, "views"),
+        ({"columns": [{"label": "a", "views": [0]}]}, "1 or more"),
+        ({"columns": [{"label": "a", "downscale": 0.5}]}, "1 or more"),
+        ({"columns": [{"label": "a", "scenes": ["kitchen"]}]}, "root"),
+        ({"columns": []}, "no columns"),
+        ({"rows": [{"label": "a"}]}, "no method"),
+        ({"rows": [{"label": "a", "method": "b"}] * 2}, "two rows have the label 'a'"),
+        ({"rows": "all"}, "must be a list"),
+        ({"seeds": []}, "seeds"),
+        ({"seeds": [1, 1]}, "seeds"),
+        ({"varies": ["hul"]}, "varies"),
+        ({"budget": "quik"}, "did you mean 'quick'"),
+        ({"kind": "tree"}, "kind"),
+    ],
+)
+def test_what_is_wrong_in_a_table_is_named(change, said):
+    with pytest.raises(ConfigError, match=r"small\.yaml") as caught:
+        table(**change) if "rows" not in change else parse_table(
+            {"columns": [{"label": "c"}], **change}, "small", "small.yaml"
+        )
+    assert said in str(caught.value)
+
+
+def test_files_and_editions_that_are_not_there_are_named(file, tmp_path):
+    with pytest.raises(ConfigError, match="did you mean 'smoke'"):
+        load_table(file, "smok")
+    with pytest.raises(ConfigError, match="no table"):
+        load_table(tmp_path / "other.yaml")
+    with pytest.raises(ConfigError, match="two editions"):
+        load_table(f"{file}:smoke", "half")
+    for text in ("[1, 2]", "a: [", "\x00"):
+        file.write_text(text)
+        with pytest.raises(ConfigError, match=r"small\.yaml"):
+            load_table(file)
