@@ -139,7 +139,7 @@ def _svg(height: float, label: str, parts: list[str]) -> str:
 
 def _nice(low: float, high: float) -> tuple[float, float, list[float]]:
     """Round limits that hold both, and the round numbers between them."""
-    span = high - low or abs(high) or 1.0
+    span = max(high - low, 1e-6 * max(abs(low), abs(high), 1.0))
     step = 10 ** np.floor(np.log10(span / 3))
     step = float(step * next(f for f in (1, 2, 5, 10) if span / (step * f) <= 6))
     first, last = np.floor(low / step), np.ceil(high / step)
