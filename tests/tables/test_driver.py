@@ -1,0 +1,249 @@
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import io
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.tables.matrix import ROOT, long_table, make, table, write
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.tables import driver, executors
+from visdom_plugin.tables.driver import run_plan
+from visdom_plugin.tables.executors import Here, Local
+from visdom_plugin.tables.overview import Overview
+from visdom_plugin.tables.state import is_held
+
+
+@pytest.fixture(autouse=True)
+def from_the_root(monkeypatch):
+    monkeypatch.chdir(ROOT)
+
+
+def _statuses(results):
+    return [outcome.status for outcome in results.outcomes.values()]
+
+
+def _starts(made):
+    return [len((d / "starts").read_text()) if (d / "starts").exists() else 0 for d in made.tasks]
+
+
+def _table_of(folder):
+    return (folder / "table.txt").read_text()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The table of `long_table`, made in one go."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        run_plan(make(folder, long_table(0)), Local(2, threads=1), write(folder))
+    assert _table_of(folder).count(" finished ") == 4 and _table_of(folder).count("no such thing") == 2
+    return _table_of(folder)
+
+
+def test_this_process_and_others_make_the_same_table_and_a_second_time_runs_nothing(tmp_path):
+    rows = [{"label": n, "method": n} for n in ("one", "two")]
+    rows.append({"label": "Bad", "method": "three+vd", "settings": {"complaint": "no"}})
+    rows.append({"label": "Crash", "method": "three+vd", "settings": {"crash": True}})
+    rows.append({"label": "Missing", "method": "missing"})
+    tables = []
+    for name, executor in (("here", Here()), ("local", Local(2, threads=1))):
+        folder = tmp_path / name
+        made = make(folder, table(rows))
+        results = run_plan(made, executor, write(folder))
+        assert _statuses(results) == ["finished"] * 4 + ["failed"] * 4 + ["not available"] * 2
+        assert results.complete
+        errors = {o.error for o in results.outcomes.values() if o.status == "failed"}
+        assert errors == {"no\n  what to do: mend it", "RuntimeError: the floor is lava"}
+        again = run_plan(make(folder, table(rows)), executor, write(folder))
+        assert _starts(made) == [1] * 8 and again.outcomes == results.outcomes
+        tables.append(_table_of(folder))
+    assert tables[0] == tables[1]
+
+
+def test_failed_runs_are_tried_again_only_when_asked(tmp_path, monkeypatch):
+    spec = table([{"label": "Bad", "method": "one", "settings": {"crash": True}}])
+    made = make(tmp_path, spec)
+    run_plan(made, Here(), write(tmp_path))
+    from tests.tables import fake_train
+
+    def mended(argv):
+        path = Path(argv[1])
+        path.write_text(path.read_text().replace("crash: true", "crash: false"))
+        return main(argv)
+
+    main = fake_train.main
+    monkeypatch.setattr(fake_train, "main", mended)
+    assert _statuses(run_plan(made, Here(), write(tmp_path))) == ["failed"] * 2
+    assert _starts(made) == [1, 1]
+    assert _statuses(run_plan(made, Here(), write(tmp_path), retry=True)) == ["finished"] * 2
+    assert _starts(made) == [2, 2] and " None None" not in _table_of(tmp_path)
+
+
+def test_only_the_rows_asked_for_are_run_and_the_others_show_what_there_is(tmp_path):
+    made = make(tmp_path)
+    assert _statuses(run_plan(made, Here(), write(tmp_path), only=[1])) == ["waiting"] * 2 + ["finished"] * 2
+    assert _starts(made) == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("once", "status", "starts"), [(True, "finished", 2), (False, "failed", driver.CHANCES)]
+)
+def test_a_killed_worker_is_replaced_as_long_as_it_gets_further(tmp_path, once, status, starts):
+    settings = {"steps": 6, "dies_at": 3, "dies_once": once}
+    made = make(tmp_path, table([{"label": "A", "method": "one", "settings": settings}], seeds=[0]))
+    results = run_plan(made, Local(1, threads=1), write(tmp_path))
+    assert _statuses(results) == [status]
+    # The first death is a step further than nothing; it counts as the first one all the same.
+    assert _starts(made) == [starts]
+    if not once:
+        assert "SIGKILL" in next(iter(results.outcomes.values())).error
+
+
+def test_the_table_is_written_before_the_end_and_tells_what_is_running(tmp_path):
+    seen = []
+    run_plan(make(tmp_path), Here(), lambda results: seen.append(_statuses(results)))
+    assert seen[0] == ["waiting"] * 4 and seen[-1] == ["finished"] * 4
+    assert any(s.count("finished") in (1, 2, 3) for s in seen)
+
+
+def test_a_run_that_another_process_holds_is_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver, "BUSY_PAUSE", 0.05)
+    made = make(tmp_path, table(seeds=[0]))
+    held = next(iter(made.tasks))
+    held.mkdir(parents=True)
+    lock = (held / "run.lock").open("a+")
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    assert is_held(held)
+    threading.Timer(0.6, lock.close).start()
+    seen = []
+    results = run_plan(made, Local(2, threads=1), lambda r: seen.append(_statuses(r)))
+    assert _statuses(results) == ["finished"] * 2 and ["running", "finished"] in seen
+    assert _starts(made) == [1, 1]
+
+
+def test_a_run_that_is_held_at_the_last_moment_is_not_a_failure(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver, "BUSY_PAUSE", 0.05)
+    made = make(tmp_path, table(seeds=[0]))
+    held = next(iter(made.tasks))
+    held.mkdir(parents=True)
+    lock = (held / "run.lock").open("a+")
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    threading.Timer(0.6, lock.close).start()
+    monkeypatch.setattr(driver.state, "is_held", lambda run_dir: False)
+    assert _statuses(run_plan(made, Local(1, threads=1), write(tmp_path))) == ["finished"] * 2
+
+
+def test_the_words_of_a_busy_run_directory_are_those_of_the_trainer(tmp_path):
+    from visdom_plugin.errors import CheckpointError
+    from visdom_plugin.tables.state import BUSY
+    from visdom_plugin.training.rundir import RunDir
+
+    with RunDir.open(tmp_path / "run", {}):
+        assert is_held(tmp_path / "run")
+        with pytest.raises(CheckpointError, match=BUSY):
+            RunDir.open(tmp_path / "run", {})
+    assert not is_held(tmp_path / "run")
+
+
+def test_two_protocols_among_finished_runs_end_the_table(tmp_path):
+    made = make(tmp_path)
+    run_plan(made, Here(), write(tmp_path))
+    path = list(made.tasks)[1] / "run.json"
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps(record | {"schema": 2}))
+    with pytest.raises(ConfigError, match="schema is 1"):
+        run_plan(made, Here(), write(tmp_path))
+
+
+def _drive(folder):
+    return subprocess.Popen([sys.executable, "-m", "tests.tables.matrix", str(folder)], cwd=ROOT)
+
+
+def _wait_for_children(made):
+    until = time.monotonic() + 30
+    while any(is_held(d) for d in made.tasks):
+        assert time.monotonic() < until, "a child outlives its driver"
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_driver_stopped_at_any_moment_leaves_a_table_that_ends_the_same(tmp_path, undisturbed, number):
+    made = make(tmp_path, long_table())
+    draw = random.Random(time.time_ns())
+    for _ in range(2):
+        process = _drive(tmp_path)
+        time.sleep(draw.uniform(0.3, 1.6))
+        process.send_signal(number)
+        process.wait(60)
+        if number == signal.SIGKILL:
+            _wait_for_children(made)
+        else:
+            # An orderly end waits for the children itself.
+            assert not any(is_held(d) for d in made.tasks)
+        if (tmp_path / "table.txt").exists():
+            assert len(_table_of(tmp_path).splitlines()) == 6
+    assert _drive(tmp_path).wait(120) == 0
+    assert _table_of(tmp_path) == undisturbed
+
+
+def test_workers_killed_at_random_leave_no_trace(tmp_path, undisturbed):
+    made = make(tmp_path, long_table())
+    executor = Local(2, threads=1)
+    draw, kills = random.Random(time.time_ns()), []
+    started = executor.start
+
+    def start_and_kill(tasks):
+        started(tasks)
+        for pid in executor.processes():
+            if len(kills) < 3 and pid not in kills:
+                kills.append(pid)
+                threading.Timer(draw.uniform(0.05, 0.5), _kill, (pid,)).start()
+
+    executor.start = start_and_kill
+    results = run_plan(made, executor, write(tmp_path))
+    assert results.complete and len(kills) == 3
+    assert _table_of(tmp_path) == undisturbed
+
+
+def _kill(pid):
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+
+
+def test_progress_counts_all_jobs_and_quiet_is_silent(tmp_path):
+    rows = [
+        {"label": "Good", "method": "one"},
+        {"label": "Bad", "method": "two", "settings": {"crash": True}},
+    ]
+    for name, quiet in (("loud", False), ("quiet", True)):
+        said = io.StringIO()
+        run_plan(
+            make(tmp_path / name, table(rows)),
+            Here(),
+            write(tmp_path),
+            overview=Overview(quiet=quiet, stream=said),
+        )
+        if quiet:
+            assert said.getvalue() == ""
+        else:
+            assert "4 runs in all, 0 of them done before" in said.getvalue()
+            assert "4/4 done, 0 running, 2 failed" in said.getvalue()
+            assert "lava" in said.getvalue() and "finished: Good" in said.getvalue()
+
+
+def test_cores_are_divided_among_workers(monkeypatch):
+    monkeypatch.setattr(executors, "count_cores", lambda: 8)
+    assert [Local(n).threads for n in (1, 3, 16)] == [8, 2, 1]
+    assert executors.environment(3)["OMP_NUM_THREADS"] == executors.environment(3)["NUMBA_NUM_THREADS"] == "3"
