@@ -73,12 +73,20 @@ def list_papers() -> list[str]:
 
 @cache
 def load_numbers(name: str) -> Numbers:
-    """The paper's table of a name.
+    """The paper's table of a name, or several with "+" between them.
 
     Raises:
-        ConfigError: for an unknown name.
+        ConfigError: for an unknown name, and for tables that print two values for one place.
     """
     known = list_papers()
+    names = [part.strip() for part in name.split("+")]
+    if len(names) > 1:
+        values: dict[tuple[str, ...], float] = {}
+        for part in names:
+            for key, value in load_numbers(part).values.items():
+                if values.setdefault(key, value) != value:
+                    raise ConfigError(f"the paper's tables {name} contradict each other: {', '.join(key)}")
+        return Numbers(name, values)
     if name not in known:
         near = difflib.get_close_matches(name, known, 1)
         raise ConfigError(

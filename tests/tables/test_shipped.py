@@ -1,0 +1,103 @@
+"""The shipped tables: their settings and their places in the paper exist, and no number of the paper is left out."""
+
+from dataclasses import replace
+
+import pytest
+
+from visdom_plugin.cli.table import Options, make_workshop
+from visdom_plugin.tables.jobs import plan
+from visdom_plugin.tables.layout import list_views, read_layout
+from visdom_plugin.tables.measures import find_measure
+from visdom_plugin.tables.paper import find_number, load_numbers
+from visdom_plugin.tables.results import Results
+from visdom_plugin.tables.spec import list_editions, list_tables, load_table
+from visdom_plugin.tables.summary import summarise
+from visdom_plugin.tables.write import write_all
+
+EDITIONS = [
+    (name, edition) for name, path in list_tables().items() for edition in (None, *list_editions(path))
+]
+NOT_BUILT = {"zerorf", "splatfields", "fsgs", "gaussianobject", "gaussianobject+vd"}
+
+
+def test_the_nine_tables_are_there_each_with_a_small_edition():
+    assert set(list_tables()) == {
+        "general_purpose",
+        "hull_chamfer",
+        "hull_variants_nerf",
+        "k_ablation",
+        "lpips",
+        "main",
+        "mask_dilation",
+        "train_times",
+        "vaxnerf",
+    }
+    assert {name for name, edition in EDITIONS if edition == "smoke"} == set(list_tables())
+
+
+@pytest.mark.parametrize(("name", "edition"), EDITIONS)
+def test_every_row_resolves_and_protocols_do_not_mix(name, edition, tmp_path):
+    spec = load_table(name, edition)
+    made = plan(spec, tmp_path, make_workshop(Options(device="cpu")))
+    missing = {spec.rows[job.row].method for job, o in made.jobs.items() if o.status == "not available"}
+    assert missing <= NOT_BUILT
+    if edition == "smoke":
+        assert {c.root for c in spec.columns} == {"built-in"} and len(spec.seeds) == 1
+        assert len({job.run_dir for job in made.jobs if job.run_dir}) >= len(spec.rows) - len(missing)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "edition"), EDITIONS)
+def test_rows_and_columns_name_places_that_the_paper_has(name, edition, tmp_path):
+    spec = load_table(name, edition)
+    summary = summarise(Results(spec))
+    numbers = load_numbers(spec.paper)
+    for r, row in enumerate(spec.rows):
+        for c, column in enumerate(spec.columns):
+            if row.paper is not None and column.paper is not None:
+                cells = [x for x in summary.cells if (x.row, x.column) == (r, c)]
+                # The paper prints three gains of its sweep of dilations, one of them at 4 views.
+                sweep = name == "mask_dilation" and edition
+                assert sweep or any(x.paper is not None for x in cells), (row.label, column.label)
+                assert all(x.mean is None and x.status == "waiting" for x in cells)
+    assert any(c.paper is not None for c in summary.cells) or (name == "hull_chamfer" and edition)
+    assert numbers.values and write_all(Results(spec), tmp_path)
+
+
+@pytest.mark.parametrize("name", list(list_tables()))
+def test_every_number_of_the_paper_stands_in_its_table(name):
+    spec = load_table(name)
+    numbers = load_numbers(spec.paper)
+    place = {
+        (row.label, column.label, views, metric): find_number(
+            numbers, row.paper, column.paper, views, find_measure(metric).paper
+        )
+        for row in spec.rows
+        for c, column in enumerate(spec.columns)
+        for views in list_views(spec, c)
+        for metric in spec.metrics
+    }
+    printed = sorted(v for v in place.values() if v is not None)
+    expected = dict(numbers.values)
+    if name == "mask_dilation":
+        gains = {k: v for k, v in expected.items() if k[-1] == "psnr_gain_db"}
+        for (dataset, views, method, _, _), gain in gains.items():
+            base = expected[dataset, views, method, "vd_dilate_r0", "psnr_db"]
+            expected[dataset, views, method, "sum", str(gain)] = base + gain
+        expected = {k: v for k, v in expected.items() if k not in gains}
+    assert printed == sorted(expected.values())
+
+
+def test_an_edition_of_the_main_table_has_every_variant_of_every_method():
+    rows = {row.method for row in load_table("main", "smoke").rows}
+    methods = ("ingp", "zipnerf-lite", "3dgs-go", "corgs-lite")
+    assert rows == {m + v for m in methods for v in ("", "+mask", "+vd")}
+    assert load_table("main", "scenes").seeds == (0, 1, 2)
+
+
+def test_the_papers_layouts_are_kept():
+    for name in ("general_purpose", "lpips", "k_ablation", "hull_variants_nerf"):
+        assert read_layout(load_table(name)).best == "group"
+    main = load_table("main")
+    assert read_layout(main).best == "column" and read_layout(main).second
+    assert read_layout(replace(main, layout={})).mean is False
