@@ -1,4 +1,4 @@
-"""The shipped tables: their settings and their places in the paper exist, and no number of the paper is left out."""
+"""The shipped tables: their settings and places in the paper exist, and no number of the paper is left out."""
 
 from dataclasses import replace
 
