@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -47,20 +48,23 @@ class Cameras:
 
         Args:
             K: (..., 3, 3) intrinsics in pixels, zero skew.
-            world_from_camera: (..., 4, 4) or (..., 3, 4) camera-to-world motion.
+            world_from_camera: (..., 4, 4) or (..., 3, 4) camera-to-world motion. This and K may be lists of
+                tensors or arrays, too.
             width, height: image size in pixels, an int or one per camera (...).
             convention: axes of `world_from_camera`: "opencv" (y down, z forward) or "opengl" (y up, z backward).
 
         Returns:
-            Cameras in OpenCV axes, in the matrices' floating dtype (float64 for integer or numpy input).
+            Cameras in OpenCV axes, in the motions' floating dtype (float32 for half precision, float64 for
+            integers), on their device, outside any graph.
 
         Raises:
             SceneError: for NaN or infinite numbers, a rotation part that is not a rotation, a skewed or
                 non-positive focal length, an empty image, or an unknown convention.
         """
-        motion = torch.as_tensor(world_from_camera)
+        motion = _as_tensor(world_from_camera)
         motion = motion if motion.is_floating_point() else motion.double()
-        intrinsics = torch.as_tensor(K).to(motion)
+        motion = motion.float() if motion.dtype in (torch.float16, torch.bfloat16) else motion
+        intrinsics = _as_tensor(K).to(motion)
         if convention not in ("opencv", "opengl"):
             raise SceneError(
                 f"unknown camera convention {convention!r}",
@@ -138,6 +142,14 @@ class Cameras:
         return Cameras(
             self.intrinsics * ratio[..., None].to(self.intrinsics), self.world_from_camera, width, height
         )
+
+
+def _as_tensor(value) -> Tensor:
+    if isinstance(value, list | tuple) and len(value) and isinstance(value[0], Tensor | np.ndarray):
+        value = torch.stack([_as_tensor(part) for part in value])
+    if isinstance(value, np.ndarray):
+        value = np.ascontiguousarray(value)  # torch knows no negative strides
+    return torch.as_tensor(value).detach()
 
 
 def _check(cameras: Cameras) -> None:

@@ -99,6 +99,17 @@ def test_contains_with_a_margin_reaches_beyond_the_grid():
     assert hull.contains(points, margin_voxels=1.5).tolist() == [True, True, True]
 
 
+@pytest.mark.parametrize("reach", [1, 2, 5])
+def test_a_margin_is_a_maximum_filter(reach):
+    from scipy.ndimage import maximum_filter
+
+    grid = np.random.default_rng(reach).random((9, 6, 4)) < 0.02
+    wanted = maximum_filter(np.pad(grid, reach), size=2 * reach + 1, mode="constant")
+    centres = np.stack(np.meshgrid(*(np.arange(n) + 0.5 - reach for n in wanted.shape), indexing="ij"), -1)
+    hull = Hull(grid, np.array([[0.0, 0, 0], grid.shape]))
+    assert np.array_equal(hull.contains(centres, margin_voxels=reach), wanted)
+
+
 def test_points_on_the_surface_are_uniform_and_repeatable():
     hull = ball()
     points = hull.sample_points(20_000, torch.Generator().manual_seed(1))

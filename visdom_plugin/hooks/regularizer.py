@@ -28,8 +28,27 @@ def outside_loss(alpha: Tensor, hull_mask: Tensor) -> Tensor:
     Returns:
         Scalar.
     """
+    if alpha.dtype in (torch.float16, torch.bfloat16):
+        alpha = alpha.float()  # 1 - 1e-6 would round to 1
     # 1e-6 keeps the gradient of a fully opaque pixel finite: at most 1e6 / (H * W).
     return torch.where(hull_mask, 0.0, -torch.log1p(-alpha.clamp(max=1 - 1e-6))).mean()
+
+
+def _image(alpha: Tensor, shape: torch.Size) -> Tensor:
+    """Opacity without the dimensions of size one that rasterisers add."""
+    kept = [d for d in alpha.shape if d != 1]
+    if kept != [d for d in shape if d != 1]:
+        raise ConfigError(
+            f"the rendered opacity has shape {tuple(alpha.shape)}, the camera's image is {tuple(shape)}",
+            where="VisDomGaussianRegularizer.loss",
+            cause="a renderer that ignores the camera's width and height, or returns colours",
+            todo="return opacity (H, W) of the size that camera.height and camera.width say",
+        )
+    return alpha if alpha.shape == shape else alpha.reshape(shape)
+
+
+# As torch.compiler.disable, but the compiler is imported at the first call, not with this module.
+_outside_graphs = getattr(torch, "_disable_dynamo", torch.compiler.disable)
 
 
 class VisDomGaussianRegularizer:
@@ -85,6 +104,7 @@ class VisDomGaussianRegularizer:
                 "points 'surface' or 'volume'"
             )
         self.hull, self.cameras, self.images = hull, cameras.to("cpu"), images
+        self._device = cameras.width.device
         self.weight, self.every, self.start, self.views_per_step = weight, every, start, views_per_step
         self.bank, self._bank = bank, {}
         self.points, self.prune_every = points, prune_every
@@ -92,12 +112,15 @@ class VisDomGaussianRegularizer:
         self._look_at = torch.as_tensor(hull.centre).to(self.cameras.world_from_camera)
 
     def initial_points(self, n: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Points to start from: xyz (n, 3) float32 world frame and rgb (n, 3) float32 in [0, 1]."""
+        """Points to start from: xyz (n, 3) float32 world frame and rgb (n, 3) float32 in [0, 1], on the device
+        of the training cameras."""
         draw = self.hull.sample_points if self.points == "surface" else self.hull.sample_inside
         xyz = draw(n, generator).float()
         if self.images is None:
-            return xyz, torch.full_like(xyz, 0.5)
-        return xyz, colour_points(self.hull, xyz, self.cameras, self.images)
+            rgb = torch.full_like(xyz, 0.5)
+        else:
+            rgb = colour_points(self.hull, xyz, self.cameras, self.images)
+        return xyz.to(self._device), rgb.to(self._device)
 
     def sample_camera(self, generator: Generator | None = None) -> Cameras:
         """One camera between a random pair of training cameras, uniform in the pair and on the way."""
@@ -111,19 +134,26 @@ class VisDomGaussianRegularizer:
         """Weighted L_i of this step, {"visdom_outside": scalar}, or {} on steps without it.
 
         Args:
-            render: draws the current Gaussians from one camera; only `.alpha` (H, W) is read.
-            step: the trainer's step.
-            generator: draws the views; the default is torch's global generator.
+            render: draws the current Gaussians from one camera, which is on the device and in the dtype of the
+                training cameras; returns opacity (H, W), (H, W, 1) or (1, H, W, 1), or an object that has it as
+                `.alpha`.
+            step: the trainer's step; only the schedule (`every`, `start`) reads it.
+            generator: CPU generator that draws the views; the default is torch's global one.
+
+        Raises:
+            ConfigError: when the opacity is not of the camera's size.
         """
         if self.weight == 0 or step < self.start or (step - self.start) % self.every:
             return {}
         total = 0.0
         for _ in range(self.views_per_step):
             camera, mask = self._draw(generator)
-            alpha = render(camera).alpha
+            drawn = render(camera.to(self._device))
+            alpha = _image(getattr(drawn, "alpha", drawn), mask.shape)
             total = total + outside_loss(alpha, mask.to(alpha.device))
         return {"visdom_outside": self.weight / self.views_per_step * total}
 
+    @_outside_graphs
     def _draw(self, generator: Generator | None) -> tuple[Cameras, Tensor]:
         """A view and the hull's silhouette in it, (H, W) bool."""
         if not self.bank:

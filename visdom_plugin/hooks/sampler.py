@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.hooks import opaque
 from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.raycast import cast
@@ -77,38 +78,65 @@ class VisDomSampler:
             )
         self.hull, self.epsilon_world = hull, float(epsilon_world)
         self.interval, self.missing, self.drop_outside = interval, missing, drop_outside
+        self._number = opaque.enter(self)
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+        self._number = opaque.enter(self)
 
     def __call__(self, origins: Tensor, directions: Tensor, near, far) -> RayBounds:
         """The same as `bound`."""
         return self.bound(origins, directions, near, far)
 
-    @torch.compiler.disable
-    @torch.no_grad()
     def bound(self, origins: Tensor, directions: Tensor, near, far) -> RayBounds:
         """Where along each ray samples may be taken. Pure; no gradient.
 
         A ray counts as a hit only when its band overlaps the caller's [near, far].
 
         Args:
-            origins, directions: (..., 3) world frame, broadcast against each other; any length but zero.
+            origins, directions: (..., 3) tensors or arrays, world frame, broadcast against each other; directions
+                of any length but zero.
             near, far: (...) tensors or numbers, in units of the direction's length.
 
         Returns:
-            RayBounds of shape (...), in the directions' dtype, on their device; near <= far everywhere.
+            RayBounds of shape (...), in the directions' dtype, on their device; near <= far everywhere. In half
+            precision the band is rounded outwards.
         """
-        crossing = cast(self.hull, origins, directions)
-        first = crossing.t_first
-        near, far = (torch.as_tensor(x).to(first).expand(first.shape) for x in (near, far))
-        last = first if self.interval == "first_hit" else crossing.t_last
-        epsilon = self.epsilon_world / directions.detach().norm(dim=-1).to(first)
-        begin, end = torch.maximum(near, first - epsilon), torch.minimum(far, last + epsilon)
-        hit = crossing.hit & (begin < end)
-        begin = torch.where(hit, begin, near)
-        end = torch.where(hit, end, far if self.missing == "full" else near)
+        origins, directions = (torch.as_tensor(x).detach() for x in (origins, directions))
+        if not directions.is_floating_point():
+            directions = directions.double()
+        if torch.compiler.is_compiling():
+            near, far = (torch.as_tensor(x, device=directions.device).detach() for x in (near, far))
+            return RayBounds(
+                *torch.ops.visdom_plugin.ray_bounds(origins, directions, near, far, self._number)
+            )
+        half = directions.dtype if directions.dtype in (torch.float16, torch.bfloat16) else None
+        if half:
+            directions = directions.float()
+        with torch.no_grad():
+            crossing = cast(self.hull, origins, directions)
+            first = crossing.t_first
+            near, far = (
+                torch.as_tensor(x, dtype=first.dtype, device=first.device).expand(first.shape)
+                for x in (near, far)
+            )
+            last = first if self.interval == "first_hit" else crossing.t_last
+            epsilon = self.epsilon_world / directions.norm(dim=-1).to(first)
+            begin, end = torch.maximum(near, first - epsilon), torch.minimum(far, last + epsilon)
+            hit = crossing.hit & (begin < end)
+            if half:
+                rounding = torch.finfo(half).eps
+                begin = torch.maximum(near.to(half), (begin - rounding * begin.abs()).to(half))
+                end = torch.minimum(far.to(half), (end + rounding * end.abs()).to(half))
+                near, far = near.to(half), far.to(half)
+            begin = torch.where(hit, begin, near)
+            end = torch.where(hit, end, far if self.missing == "full" else near)
         return RayBounds(begin, end, hit)
 
     def keep(self, points: Tensor) -> Tensor:
         """(...) bool of sample points (..., 3), world frame: False where they shall count nothing."""
+        if torch.compiler.is_compiling():
+            return torch.ops.visdom_plugin.keep(points.detach(), self._number)
         if not self.drop_outside:
             return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
         return self.hull.contains(points)

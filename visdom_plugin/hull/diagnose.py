@@ -12,10 +12,8 @@ import numpy as np
 from visdom_plugin.cameras import Cameras
 from visdom_plugin.hull.blocks import block_carve, sum_areas
 from visdom_plugin.hull.carve import keep_rule
-from visdom_plugin.hull.covisibility import advise_k
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
-from visdom_plugin.hull.outlines import draw_outlines
 from visdom_plugin.hull.raycast import depth_and_silhouette
 from visdom_plugin.hull.region import grid_in
 from visdom_plugin.hull.rule import KeepRule
@@ -143,6 +141,10 @@ def votes_per_k(silhouettes: Silhouettes, grid: Grid, domain: VisibleDomain) -> 
 
 def choose_k(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes) -> int:
     """The K that `advise_k` advises: the largest of 3, 2, 1 whose hull covers every mask as K = 1 does."""
+    # These need OpenCV, which carving with a given K does not.
+    from visdom_plugin.hull.covisibility import advise_k
+    from visdom_plugin.hull.outlines import draw_outlines
+
     advice = advise_k(draw_outlines(cameras, silhouettes))
     log.info("k=%s takes %s", domain.k, advice.why)
     return advice.k

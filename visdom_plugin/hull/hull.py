@@ -156,9 +156,15 @@ class Hull:
         def make():
             grid = self.occupancy
             if reach:
-                from scipy.ndimage import maximum_filter
-
-                grid = maximum_filter(np.pad(grid, reach), size=2 * reach + 1)
+                grid = np.pad(grid, reach)
+                for axis in range(3):
+                    row = np.moveaxis(grid, axis, 0)
+                    grown = row.copy()
+                    for shift in range(1, reach + 1):
+                        grown[shift:] |= row[:-shift]
+                        grown[:-shift] |= row[shift:]
+                    grid = np.moveaxis(grown, 0, axis)
+                grid = np.ascontiguousarray(grid)
             return torch.from_numpy(grid).to(device)
 
         return self._once(("grid", str(device), reach), make)
