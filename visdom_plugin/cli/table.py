@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,8 @@ from visdom_plugin.tables.spec import Column, TableSpec, list_editions, list_tab
 
 MODULES = {"train": "visdom_plugin.cli.train", "hull": "visdom_plugin.cli.measure_hull"}
 """What does a job of each kind of table."""
+log = logging.getLogger(__name__)
+
 FAILURES = 1
 """Exit status of a table with failed runs."""
 
@@ -163,10 +166,13 @@ def _resolve(kind: str, method: str, budget: str, options: Options) -> Any:
     from visdom_plugin import registry
     from visdom_plugin.cli.options import choose_budget
     from visdom_plugin.tables.jobs import Resolved
-    from visdom_plugin.training.hull_settings import HullRunConfig
 
     if kind == "hull":
-        return Resolved("hull", "full", HullRunConfig()) if method == "hull" else None
+        from visdom_plugin.training.hull_settings import METHOD, HullRunConfig
+
+        if method != METHOD:
+            raise ConfigError(f"a hull table has no method {method!r}", todo=f"method: {METHOD}")
+        return Resolved(METHOD, "full", HullRunConfig())
     if budget == "auto" and options.executor == "slurm" and options.device == "auto":
         raise ConfigError(
             "budget auto cannot be known before a job stands on its node",
@@ -178,9 +184,7 @@ def _resolve(kind: str, method: str, budget: str, options: Options) -> Any:
     except ConfigError as error:
         if not registry.installed().presets:
             raise
-        import logging
-
-        logging.getLogger(__name__).warning("not available: %s", error.what)
+        log.warning("not available: %s", error.what)
         return None
     return Resolved(preset.name, budget, getattr(preset, budget))
 
@@ -241,21 +245,17 @@ def _read_roots(options: Options) -> dict[str, Path]:
 
 def _make_executor(spec: TableSpec, options: Options, folder: Path, tick: Any) -> Any:
     from visdom_plugin.tables.executors import Here, Local
-
-    kind = options.executor or ("local" if options.workers else "process")
-    if options.workers is not None and (options.workers < 1 or kind != "local"):
-        raise ConfigError(
-            f"--workers {options.workers} does not go with the executor {kind!r}"
-            if kind != "local"
-            else f"--workers is {options.workers}; it must be 1 or more"
-        )
-    if kind == "process":
-        return Here(tick)
-    if kind == "local":
-        return Local(options.workers or 1)
     from visdom_plugin.tables.slurm import Slurm, read_config
 
-    return Slurm(read_config(spec, options.slurm), folder)
+    kind = options.executor or ("process" if options.workers is None else "local")
+    if options.workers is not None and kind != "local":
+        raise ConfigError(f"--workers {options.workers} does not go with the executor {kind!r}")
+    if options.workers is not None and options.workers < 1:
+        raise ConfigError(f"--workers is {options.workers}; it must be 1 or more")
+    resources = read_config(spec, options.slurm)
+    if kind == "process":
+        return Here(tick)
+    return Local(options.workers or 1) if kind == "local" else Slurm(resources, folder)
 
 
 if __name__ == "__main__":

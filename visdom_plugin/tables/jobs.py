@@ -124,6 +124,9 @@ def plan(spec: TableSpec, runs: Path, workshop: Workshop, roots: Mapping[str, Pa
             from_plain(workshop.reading, column.reading, f"column {column.label!r} of {spec.source}")
     refuse_mixture(_facts(spec, resolved), spec.varies, spec.source)
     folders = [_find_scenes(spec, column, dict(roots or {})) for column in spec.columns]
+    found = {path for scenes in folders if scenes for path in scenes.values() if path is not None}
+    if found:
+        log.info("looking at the files of %d scenes", len(found))
     hashes: dict[Path | None, str] = {}
     jobs: dict[Job, Outcome] = {}
     tasks: dict[Path, Task] = {}
