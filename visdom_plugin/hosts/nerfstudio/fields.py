@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider, SceneCollider
@@ -95,7 +96,9 @@ def silhouette_loss(accumulation: Tensor, image: Tensor) -> Tensor:
             where="--pipeline.model.mask-weight",
             todo="pass `visdom --background alpha`, or set the weight to 0",
         )
-    return mask_loss(accumulation[..., 0], image[..., 3].to(accumulation))
+    # Nerfstudio trains in mixed precision, where torch refuses this loss.
+    with torch.autocast(accumulation.device.type, enabled=False):
+        return mask_loss(accumulation[..., 0].float(), image[..., 3].to(accumulation.device).float())
 
 
 class _HullField:
@@ -109,6 +112,12 @@ class _HullField:
         if not config.vd.enabled:
             return
         with told():
+            if config.vd.drop_outside:
+                raise ConfigError(
+                    "nerfstudio's methods bound rays, they do not drop single samples",
+                    where="--pipeline.model.vd.drop-outside",
+                    todo="leave it off; --pipeline.model.vd.hull-at-inference True draws inside the band only",
+                )
             known = known_views(self.kwargs.get("metadata"), self.method)
             hull = config.hull.carve(*known.views.silhouettes())
             hook = config.vd.build(hull, known.views)
