@@ -243,6 +243,18 @@ def test_progress_counts_all_jobs_and_quiet_is_silent(tmp_path):
             assert "lava" in said.getvalue() and "finished: Good" in said.getvalue()
 
 
+def test_only_old_leftovers_are_removed(tmp_path):
+    from visdom_plugin.tables.state import remove_old_parts
+
+    old, new, whole = (tmp_path / name for name in (".part-1-table.md", ".part-2-table.md", "table.md"))
+    for path in (old, new, whole):
+        path.write_text("x")
+    os.utime(old, (0, 0))
+    os.utime(whole, (0, 0))
+    remove_old_parts(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [new.name, whole.name]
+
+
 def test_cores_are_divided_among_workers(monkeypatch):
     monkeypatch.setattr(executors, "count_cores", lambda: 8)
     assert [Local(n).threads for n in (1, 3, 16)] == [8, 2, 1]

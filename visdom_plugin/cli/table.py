@@ -94,6 +94,7 @@ def run_spec(spec: TableSpec, options: Options) -> int:
     from visdom_plugin.tables.driver import gather, look, run_plan
     from visdom_plugin.tables.jobs import plan
     from visdom_plugin.tables.overview import Overview
+    from visdom_plugin.tables.state import remove_old_parts
 
     folder = options.out or Path("tables") / "-".join(filter(None, (spec.name, spec.edition)))
     if folder.exists() and not folder.is_dir():
@@ -102,10 +103,13 @@ def run_spec(spec: TableSpec, options: Options) -> int:
     for label in options.only:
         if label not in labels:
             raise ConfigError(f"there is no row {label!r}", where="--only", todo=f"rows: {', '.join(labels)}")
-    made = plan(spec, options.runs or folder / "runs", make_workshop(options), _read_roots(options))
+    runs = options.runs or folder / "runs"
+    made = plan(spec, runs, make_workshop(options), _read_roots(options))
     if options.dry_run:
         sys.stdout.write("\n".join(describe_plan(made)) + "\n")
         return 0
+    for place in (folder, runs):
+        remove_old_parts(place)
     overview = Overview(quiet=options.quiet, workers=options.workers or 1)
     results = run_plan(
         made,

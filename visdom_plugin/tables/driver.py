@@ -32,6 +32,10 @@ BUSY_PAUSE = 2.0
 Writer = Callable[[Results], object]
 
 
+class Interrupted(KeyboardInterrupt):
+    """A signal stopped the table; the same command goes on."""
+
+
 @dataclass
 class _Watched:
     """What the driver remembers of a task that is not done."""
@@ -74,7 +78,7 @@ def run_plan(
 
     Raises:
         ConfigError: when finished runs turn out to be of different protocols.
-        KeyboardInterrupt: after Ctrl-C or SIGTERM; what was running can be resumed, the table is written.
+        Interrupted: after Ctrl-C or SIGTERM; what was running can be resumed, the table is written.
     """
     if retry:
         for run_dir in plan.tasks:
@@ -100,11 +104,13 @@ def run_plan(
         try:
             table.write()
             _work(queue, executor, table, overview)
-        except BaseException:
+        except BaseException as stop:
             executor.stop()
             for run_dir, outcome in known.items():
                 if outcome.status == "running":
                     known[run_dir] = state.read_outcome(run_dir)
+            if isinstance(stop, KeyboardInterrupt):
+                raise Interrupted from None
             raise
         finally:
             table.write()

@@ -44,6 +44,7 @@ class Overview:
         """Says what there is to do."""
         self._plan, self._known = plan, known
         self._begin = self._shown = time.monotonic()
+        self._share_before = (len(known) - to_run) / max(len(known), 1)
         if self.quiet:
             return
         if to_run and self.stream.isatty():
@@ -103,12 +104,13 @@ class Overview:
         counts = {s: sum(o.status == s for _, o in known) for s in ("finished", "failed", "running")}
         done = counts["finished"] + counts["failed"]
         shares = {d: self._share(d, o) for d, o in known}
+        share = sum(shares.values()) / max(len(shares), 1)
         note = f"{done}/{len(known)} done, {counts['running']} running"
         note += f", {counts['failed']} failed" if counts["failed"] else ""
-        left = self._estimate(shares)
+        left = self._estimate(shares, share)
         if left is not None and done < len(known):
             note += f", about {spell_seconds(left)} left"
-        return note, sum(shares.values()) / max(len(shares), 1)
+        return note, share
 
     def _share(self, run_dir: Path, outcome: Outcome) -> float:
         if outcome.status in ("finished", "failed"):
@@ -116,8 +118,9 @@ class Overview:
         steps = self._plan.tasks[run_dir].steps
         return min(read_step(run_dir) / steps, 1.0) if outcome.status == "running" and steps else 0.0
 
-    def _estimate(self, shares: dict[Path, float]) -> float | None:
-        """Seconds left: what finished runs of the same method took on average, or of any."""
+    def _estimate(self, shares: dict[Path, float], share: float) -> float | None:
+        """Seconds left: by what finished runs of the same method, or of any, took on average; before the first, by
+        the steps done since the begin."""
         took: dict[str, list[float]] = {}
         for run_dir, outcome in self._known.items():
             timing = (outcome.record or {}).get("timing") or {}
@@ -128,7 +131,8 @@ class Overview:
                 took.setdefault(self._plan.tasks[run_dir].method, []).append(seconds)
         every = [s for values in took.values() for s in values]
         if not every:
-            return None
+            gained = share - self._share_before
+            return (time.monotonic() - self._begin) * (1 - share) / gained if gained > 0 else None
         left = 0.0
         for run_dir, share in shares.items():
             values = took.get(self._plan.tasks[run_dir].method, every)

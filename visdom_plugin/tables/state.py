@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import json
 import os
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from visdom_plugin.tables.results import Outcome
-from visdom_plugin.training.files import write_json
+from visdom_plugin.training.files import MARK, write_json
 
 BUSY = "another process is training into this run directory"
 """What a command says that finds its run directory held by a living process."""
@@ -100,6 +102,14 @@ def is_held(run_dir: Path) -> bool:
     except OSError:
         return False
     return False
+
+
+def remove_old_parts(folder: Path, seconds: float = 600) -> None:
+    """Removes what a killed driver left half-written in a folder; what is younger may be another driver's."""
+    for part in folder.glob(f"{MARK}*"):
+        with suppress(OSError):
+            if time.time() - part.stat().st_mtime > seconds:
+                part.unlink()
 
 
 def explain_exit(code: int, said: str) -> str:
