@@ -23,6 +23,8 @@ class Request:
     """Training views by hand: an index file, or positions and names with commas between."""
     test_list: str | None = None
     """Test views by hand, in the same way."""
+    hold_out: bool = True
+    """False lets views train that only the layout's own rule sets aside for testing (leave-one-out)."""
     frame: int | None = None
     """Of a video layout (ActorsHQ): which frame; None takes the first there is."""
     mask_source: Literal["auto", "folder", "alpha"] = "auto"

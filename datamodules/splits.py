@@ -106,12 +106,14 @@ def choose(
         tested, hashes[test_where] = _read(root, test_where, count, request.allow_outside)
     if tested is None:
         taken = set(train or ())
-        tested = [i for i in pools.test if i not in taken]
-        rules.append(pools.rule)
+        tested = [i for i in pools.test if i not in taken] if request.hold_out else []
+        rules.append(pools.rule if request.hold_out else "no view is held out")
     if train is None:
         # Test views by the layout's rule stay out of training even when nobody asks for them.
-        free = set(pools.test) if not request.test and request.test_list is None else set(tested)
-        train, rule = _spread(root, names, [i for i in pools.train if i not in free], request.views)
+        unasked = not request.test and request.test_list is None and request.hold_out
+        free = set(pools.test) if unasked else set(tested)
+        pool = pools.train if request.hold_out else sorted({*pools.train, *pools.test})
+        train, rule = _spread(root, names, [i for i in pool if i not in free], request.views)
         rules.append(rule)
     _refuse_shared(train, tested, f"{train_where} and {test_where}", root)
     return Split(train, tested, hashes, "; ".join(rules))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from torch import Tensor
@@ -48,6 +48,22 @@ class Views:
         """Where one view's mask comes from."""
         return self.mask_origins[index] if self.mask_origins else "given"
 
+    def take(self, indices: Sequence[int]) -> Views:
+        """Some of the views, in the order given."""
+
+        def chosen(items: Sequence[Any]) -> tuple[Any, ...]:
+            return tuple(items[i] for i in indices) if items else ()
+
+        return Views(
+            self.cameras[list(indices)],
+            chosen(self.images),
+            chosen(self.masks),
+            chosen(self.names),
+            chosen(self.mono_depths),
+            chosen(self.ignore),
+            chosen(self.mask_origins),
+        )
+
     def silhouettes(self) -> tuple[Cameras, Sequence[Tensor]]:
         """What may carve: the cameras and masks of the views whose mask was given.
 
@@ -78,6 +94,26 @@ class Scene:
     """What the reader has to say about how it understood the data, one line each."""
     mesh: tuple[Tensor, Tensor] | None = None
     """Exact surface where it is known: vertices (V, 3) float64 and faces (F, 3) int64, outward."""
+
+
+def hold_out(scene: Scene, index: int) -> Scene:
+    """The scene with one training view as its only test view, and without its own test views.
+
+    Masks that were made of other views' hulls would tell of the held-out view: hold out first, fill masks then.
+
+    Args:
+        index: position among the training views.
+    """
+    rest = [i for i in range(len(scene.train)) if i != index]
+    train, test = scene.train.take(rest), scene.train.take([index])
+    source = {
+        **scene.source,
+        "views": len(train),
+        "train": list(train.names),
+        "test": list(test.names),
+        "held_out": test.names[0],
+    }
+    return replace(scene, train=train, test=test, source=source)
 
 
 def describe_masks(views: Views) -> list[str]:

@@ -1,4 +1,4 @@
-"""visdom-eval: measures a run again from its last checkpoint."""
+"""visdom-eval: measures a run again from its last checkpoint, or a method by leaving each view out in turn."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ from visdom_plugin.cli import errors
 
 @dataclass(frozen=True)
 class Options:
-    """Renders the test views of a run from its last checkpoint and measures them again."""
+    """Renders the test views of a run from its last checkpoint and measures them again.
+
+    With --leave-one-out in place of a run it takes a method and the options of visdom-train, and measures on each
+    training view what was made without it: visdom-eval --leave-one-out method:3dgs-go+vd --data DIR --views 4
+    """
 
     run: tyro.conf.Positional[Path]
     """Run directory, as visdom-train names it."""
@@ -32,7 +36,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return errors.run(_evaluate, argv)
 
 
-def _evaluate(argv: Sequence[str]) -> None:
+def _evaluate(argv: Sequence[str]) -> int:
+    if "--leave-one-out" in argv:
+        from visdom_plugin.cli.leave_one_out import leave_one_out
+
+        return leave_one_out([word for word in argv if word != "--leave-one-out"])
     options = tyro.cli(Options, args=argv, prog="visdom-eval")
 
     from visdom_plugin.cli.report import say, show_result
@@ -45,6 +53,7 @@ def _evaluate(argv: Sequence[str]) -> None:
     record = evaluate_again(method, config, hull, scene, device=device, run_dir=options.run)
     if not options.quiet:
         show_result(record, options.run)
+    return 0
 
 
 if __name__ == "__main__":

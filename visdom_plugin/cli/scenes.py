@@ -69,7 +69,8 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None) -> Scene:
         raise CheckpointError(
             f"the run's scene is not at {path} any more", where=run, todo="say where it is with --data DIR"
         )
-    scene = open_scene(path, **{name: noted[name] for name in READING if name in noted})
+    asked = {name: noted[name] for name in READING if name in noted}
+    scene = open_scene(path, **asked) if "held_out" not in noted else _open_held_out(path, noted, asked)
     if hash_views(scene.train) != noted["hashes"]["train_views"]:
         raise CheckpointError(
             f"the scene at {path or '(built-in)'} is not the one this run was trained on",
@@ -78,6 +79,16 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None) -> Scene:
             todo="pass the right folder with --data DIR",
         )
     return scene
+
+
+def _open_held_out(path: Path | None, noted: dict[str, Any], asked: dict[str, Any]) -> Scene:
+    from visdom_plugin.scene import hold_out
+    from visdom_plugin.training.missing_masks import fill_masks
+
+    whole = open_scene(path, **asked, fill=False, hold_out=False)
+    if noted["held_out"] not in whole.train.names:
+        return whole
+    return fill_masks(hold_out(whole, whole.train.names.index(noted["held_out"])), asked["missing_masks"])
 
 
 def open_run(run: Path, data: Path | None, device_name: str):

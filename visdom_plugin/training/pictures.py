@@ -107,6 +107,25 @@ def _sheet_height(height: int, width: int) -> int:
     return max(1, round(height * SHEET_WIDTH_PX / width))
 
 
+def draw_error(truth: np.ndarray, render: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8: mean absolute difference over channels, black for none, brightest from half the range."""
+    import cv2
+
+    difference = cv2.absdiff(truth, render).astype(np.float32).mean(axis=2)
+    grey = (2 * difference).clip(0, 255).round().astype(np.uint8)
+    return np.ascontiguousarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[..., ::-1])
+
+
+def read_png(path: Path) -> np.ndarray:
+    """What `write_png` wrote of a colour picture, (H, W, 3) uint8 RGB."""
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise OSError(f"{path} is no picture")
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
 def write_video(path: Path, frames: list[np.ndarray], fps: int = 30) -> str:
     """Writes frames (H, W, 3) uint8 of equal size as mp4: H.264 where PyAV is there, else MPEG-4 by OpenCV.
 
