@@ -19,7 +19,8 @@ from visdom_plugin.render import Render
 from visdom_plugin.seeding import generator
 
 FADED_OPACITY = 0.004
-"""What is left of a faded Gaussian. Below MCMCStrategy's `min_opacity` of 0.005: it counts such Gaussians as dead and moves them to living ones."""
+"""What is left of a faded Gaussian. MCMCStrategy counts what is below its `min_opacity` of 0.005 as dead and moves
+it to a living one."""
 _CEILING = math.log(FADED_OPACITY / (1 - FADED_OPACITY))
 
 
