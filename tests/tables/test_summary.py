@@ -102,7 +102,7 @@ def test_ranks_count_the_rows_that_print_something_better(results):
             and c.n == c.of
             and (not by_group or results.spec.rows[c.row].group == results.spec.rows[cell.row].group)
         ]
-        if cell.n < cell.of or len(rivals) == 1:
+        if cell.n < cell.of or len(set(rivals)) == 1:
             assert cell.rank is None
             continue
         order = sorted(rivals, reverse=measure.higher_is_better)
@@ -121,6 +121,7 @@ def cell_of(row, mean, measure="psnr", n=1):
         ("psnr", [22.001, 22.004, 21], [1, 1, 3]),
         ("psnr", [22, 21, 21, 20], [1, 2, 2, 4]),
         ("train_min", [2.0, 10.0, 10.0], [1, 2, 2]),
+        ("psnr", [20.001, 20.0, 20.003], [None, None, None]),
     ],
 )
 def test_ties_share_a_rank(measure, means, ranks):

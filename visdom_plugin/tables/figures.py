@@ -1,4 +1,7 @@
-"""Figures of the page as inline SVG: training curves, and the spread over seeds. Colours are the page's."""
+"""Figures of the page as inline SVG: training curves, and the spread over seeds.
+
+Colours of middle brightness, so that they show on light and dark pages; the page's style may refine them.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,12 @@ import numpy as np
 
 from visdom_plugin.tables.measures import Measure
 
-COLOURS = 10
-"""Classes c0, c1, ... that the page's style colours; later lines are dashed."""
+HUES = (210, 25, 140, 330, 265, 45, 185, 0, 90, 235)
+"""Of lines, in degrees; later ones are dashed."""
 _POINTS = 40
 _WIDTH, _HEIGHT = 560, 240
-_LEFT, _RIGHT, _TOP, _BOTTOM = 46, 12, 10, 30
+_LEFT, _RIGHT, _TOP, _BOTTOM = 46, 24, 10, 30
+_DOT, _PAPER = "hsl(210,65%,50%)", "hsl(25,75%,50%)"
 
 
 @dataclass(frozen=True)
@@ -76,14 +80,16 @@ def draw_curves(series: Sequence[tuple[int, str, np.ndarray]]) -> str:
     parts = []
     for tick in ticks:
         x, y = place(0, tick)
-        parts.append(f'<line class="grid" x1="{x}" y1="{y:.1f}" x2="{_WIDTH - _RIGHT}" y2="{y:.1f}"/>')
+        parts.append(
+            f'<line class="grid" stroke="#bbb" x1="{x}" y1="{y:.1f}" x2="{_WIDTH - _RIGHT}" y2="{y:.1f}"/>'
+        )
         parts.append(f'<text x="{x - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:g}</text>')
     for share in (0, 0.5, 1):
         x, _ = place(share, low)
         parts.append(f'<text x="{x:.0f}" y="{_HEIGHT - 12}" text-anchor="middle">{share:.0%}</text>')
     for colour, label, curve in series:
         points = " ".join("{:.1f},{:.1f}".format(*place(x, y)) for x, y in curve)
-        parts.append(f'<polyline class="{_colour(colour)}" points="{points}">{_title(label)}</polyline>')
+        parts.append(f'<polyline fill="none" {_pen(colour)} points="{points}">{_title(label)}</polyline>')
     return _svg(_HEIGHT, "training PSNR over the share of the schedule", parts)
 
 
@@ -100,7 +106,9 @@ def draw_spread(rows: Sequence[Dots], measure: Measure) -> str:
     parts = []
     for tick in ticks:
         x = place(tick)
-        parts.append(f'<line class="grid" x1="{x:.1f}" y1="{_TOP}" x2="{x:.1f}" y2="{height - _BOTTOM}"/>')
+        parts.append(
+            f'<line class="grid" stroke="#bbb" x1="{x:.1f}" y1="{_TOP}" x2="{x:.1f}" y2="{height - _BOTTOM}"/>'
+        )
         parts.append(f'<text x="{x:.1f}" y="{height - 12}" text-anchor="middle">{tick:g}</text>')
     for i, row in enumerate(rows):
         y = _TOP + pitch * (i + 0.5)
@@ -109,23 +117,27 @@ def draw_spread(rows: Sequence[Dots], measure: Measure) -> str:
         if row.paper is not None:
             x = place(row.paper)
             said = _title(f"{row.label}: paper {measure.spell(row.paper)}")
-            parts.append(f'<path class="paper" d="M{x:.1f} {y - 6}l6 6l-6 6l-6 -6z">{said}</path>')
+            parts.append(
+                f'<path fill="none" stroke="{_PAPER}" d="M{x:.1f} {y - 6}l6 6l-6 6l-6 -6z">{said}</path>'
+            )
         x = place(row.mean)
-        parts.append(f'<line class="mean" x1="{x:.1f}" y1="{y - 7}" x2="{x:.1f}" y2="{y + 7}"/>')
+        pen = 'class="mean" stroke="#777" stroke-width="2"'
+        parts.append(f'<line {pen} x1="{x:.1f}" y1="{y - 7}" x2="{x:.1f}" y2="{y + 7}"/>')
         for value in row.seeds:
             said = _title(f"{row.label}: {measure.spell(value)}")
-            parts.append(f'<circle class="dot" cx="{place(value):.1f}" cy="{y}" r="3.5">{said}</circle>')
+            parts.append(f'<circle fill="{_DOT}" cx="{place(value):.1f}" cy="{y}" r="3.5">{said}</circle>')
     return _svg(height, f"{measure.title}: seeds, mean and the paper's number", parts)
 
 
 def swatch(colour: int) -> str:
     """A short line in a colour, for a legend."""
-    line = f'<line class="{_colour(colour)}" x1="1" y1="6" x2="25" y2="6"/>'
+    line = f'<line {_pen(colour)} x1="1" y1="6" x2="25" y2="6"/>'
     return f'<svg class="swatch" viewBox="0 0 26 12" width="26" height="12" aria-hidden="true">{line}</svg>'
 
 
-def _colour(number: int) -> str:
-    return f"c{number % COLOURS}" + (" dashed" if number // COLOURS % 2 else "")
+def _pen(number: int) -> str:
+    dashes = ' stroke-dasharray="5 3"' if number // len(HUES) % 2 else ""
+    return f'stroke="hsl({HUES[number % len(HUES)]},65%,50%)" stroke-width="2"{dashes}'
 
 
 def _title(text: str) -> str:
@@ -133,13 +145,14 @@ def _title(text: str) -> str:
 
 
 def _svg(height: float, label: str, parts: list[str]) -> str:
-    head = f'<svg class="figure" viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escape(label)}">'
+    size = f'viewBox="0 0 {_WIDTH} {height}" font-size="11"'
+    head = f'<svg class="figure" {size} role="img" aria-label="{escape(label)}">'
     return head + "".join(parts) + "</svg>"
 
 
 def _nice(low: float, high: float) -> tuple[float, float, list[float]]:
     """Round limits that hold both, and the round numbers between them."""
-    span = max(high - low, 1e-6 * max(abs(low), abs(high), 1.0))
+    span = max(high - low, 1e-3 * max(abs(low), abs(high), 1.0))
     step = 10 ** np.floor(np.log10(span / 3))
     step = float(step * next(f for f in (1, 2, 5, 10) if span / (step * f) <= 6))
     first, last = np.floor(low / step), np.ceil(high / step)

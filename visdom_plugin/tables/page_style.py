@@ -1,10 +1,6 @@
 """The page's style sheet, for light and dark screens."""
 
-_HUES = (210, 25, 140, 330, 265, 45, 185, 0, 90, 235)
-_COLOURS = "".join(f".c{i}{{stroke:hsl({hue} 65% 50%)}}" for i, hue in enumerate(_HUES))
-
-STYLE = (
-    """
+STYLE = """
 :root{color-scheme:light dark;--ink:#1a1a1a;--soft:#666;--line:#ccc;--paper:#fff;--best:#c9f2c9;
 --second:#d6eefa;--off:#f6f6f6}
 @media (prefers-color-scheme:dark){
@@ -16,7 +12,7 @@ summary h2{display:inline-block;margin:.6rem 0;cursor:pointer}
 .wide{overflow-x:auto;margin:1rem 0}
 table{border-collapse:collapse;border-top:2px solid var(--ink);border-bottom:2px solid var(--ink);
 font-variant-numeric:tabular-nums}
-caption{text-align:left;font-weight:600;padding:.3rem 0}
+caption{text-align:left;white-space:nowrap;font-weight:600;padding:.3rem 0}
 th,td{padding:.25rem .7rem;text-align:right;vertical-align:top;white-space:nowrap}
 th:first-child{text-align:left} thead th{border-bottom:1px solid var(--ink)} th{font-weight:500}
 tr.group th{font-style:italic;padding-top:.6rem;color:var(--soft)}
@@ -24,18 +20,15 @@ td.best{background:var(--best)} td.second{background:var(--second)}
 td.partial,td.absent{background:var(--off);color:var(--soft)}
 .spread,.beside{color:var(--soft);font-size:.85em}
 pre{white-space:pre-wrap;background:var(--off);padding:.6rem;border-left:3px solid var(--line)}
-figure{margin:1rem 0} figcaption{font-weight:600;margin-bottom:.3rem}
+figure{margin:1rem 0}
+.side{display:flex;flex-wrap:wrap;align-items:flex-start;gap:0 2.5rem}
+.side figure{flex:1 1 30rem} .side .wide{max-width:100%}
+figcaption{font-weight:600;margin-bottom:.3rem}
 svg.figure{width:100%;max-width:44rem;height:auto;display:block}
-svg text{fill:var(--ink);font-size:11px}
-.grid{stroke:var(--line);stroke-width:1} polyline{fill:none;stroke-width:2} .swatch line{stroke-width:3}
-.dashed{stroke-dasharray:5 3}
-.dot{fill:hsl(210 65% 50%);fill-opacity:.75} .mean{stroke:var(--ink);stroke-width:2} .paper{fill:none;
-stroke:hsl(25 75% 50%);stroke-width:1.5}
+svg text{fill:var(--ink)}
+.grid{stroke:var(--line)} .mean{stroke:var(--ink)}
 .legend{display:flex;flex-wrap:wrap;gap:.2rem 1rem}
 .strips{display:flex;flex-wrap:wrap;gap:.8rem 1.4rem}
 .strip img{margin-right:2px;border:1px solid var(--line);vertical-align:top} .strip p{margin:.1rem 0;
 font-size:.85em}
 """
-    + _COLOURS
-    + "\n"
-)

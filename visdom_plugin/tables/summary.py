@@ -126,8 +126,8 @@ def summarise(results: Results) -> Summary:
 def rank_cells(cells: Sequence[Cell], groups: Sequence[str]) -> list[Cell]:
     """The same cells with ranks: whole ones, of the same column, views, measure and group of rows.
 
-    Compared is what is printed, so that two numbers that look the same rank the same. A cell that has nothing
-    to be compared with has no rank.
+    Compared is what is printed, so that two numbers that look the same rank the same. Where all are the same,
+    or there is one alone, there are no ranks.
 
     Args:
         groups: by row.
@@ -139,8 +139,9 @@ def rank_cells(cells: Sequence[Cell], groups: Sequence[str]) -> list[Cell]:
     ranked = []
     for cell in cells:
         rivals = contests[_contest(cell, groups)]
-        if cell.whole and len(rivals) > 1:
-            cell = replace(cell, rank=1 + sum(_better(c, cell) for c in rivals))
+        if cell.whole and len({_printed(c) for c in rivals}) > 1:
+            better = sum(_is_better(_printed(c), _printed(cell), cell.measure) for c in rivals)
+            cell = replace(cell, rank=1 + better)
         ranked.append(cell)
     return ranked
 
@@ -157,10 +158,12 @@ def _contest(cell: Cell, groups: Sequence[str]) -> tuple:
     return cell.column, cell.views, cell.measure, groups[cell.row]
 
 
-def _better(a: Cell, b: Cell) -> bool:
-    measure = MEASURES[a.measure]
-    x, y = round(a.mean, measure.digits), round(b.mean, measure.digits)
-    return x > y if measure.higher_is_better else x < y
+def _printed(cell: Cell) -> float:
+    return round(cell.mean, MEASURES[cell.measure].digits)
+
+
+def _is_better(x: float, y: float, measure: str) -> bool:
+    return x > y if MEASURES[measure].higher_is_better else x < y
 
 
 def _values_of(jobs, place, scenes, seeds, measure: Measure) -> Iterable[SceneValue]:

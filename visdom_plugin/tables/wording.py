@@ -59,8 +59,9 @@ def describe_numbers(spec: TableSpec, summary: Summary) -> list[str]:
         lines.append(f"± is the sample standard deviation over {len(spec.seeds)} seeds.")
     if layout.best != "none" and any(c.rank for c in summary.cells):
         among = "the rows of a group" if layout.best == "group" else "all rows"
-        marks = "Best and second best" if layout.second else "Best"
-        lines.append(f"{marks} among {among} are marked, of cells whose every run gave its number.")
+        marks = "best and the second best" if layout.second else "best"
+        verb = "are" if layout.second else "is"
+        lines.append(f"The {marks} of {among} {verb} marked, among cells whose every run gave its number.")
     if any(c.paper is not None for c in summary.cells):
         lines.append("Beside ours: the paper's number, and ours minus the paper's in brackets.")
     if any(not c.whole and c.n for c in summary.cells):

@@ -103,13 +103,13 @@ def _footer(spec: TableSpec, summary: Summary) -> str:
 
 def _place(spec: TableSpec, summary: Summary, c: int, views: int, unfolded: bool, many: bool) -> str:
     """Everything behind one column and number of views."""
-    layout = read_layout(spec)
-    parts = [_spread(spec, summary, c, views, m) for m in spec.metrics]
-    if layout.pictures:
+    parts = [_side([_spread(spec, summary, c, views, m) for m in spec.metrics])]
+    if read_layout(spec).pictures:
         jobs = [(j, o) for j, o in summary.outcomes if (j.column, j.views) == (c, views)]
         parts.append(_curves(spec, jobs))
         parts.append(_pictures(spec, c, jobs, MANY_HEIGHT_PX if many else HEIGHT_PX))
-    parts += [_scenes(spec, summary, c, views, m) for m in spec.metrics]
+    if len(spec.columns[c].scenes) * len(spec.seeds) > 1:
+        parts.append(_side([_scenes(spec, summary, c, views, m) for m in spec.metrics]))
     title = escape(f"{spec.columns[c].label}, {spell_views(views)}")
     inner = "\n".join(part for part in parts if part)
     if not inner:
@@ -217,6 +217,11 @@ def _finished(jobs: list[tuple[Job, Outcome]], row: int) -> Iterator[tuple[Job, 
 
 def _figure(title: str, content: str) -> str:
     return f"<figure>\n<figcaption>{escape(title)}</figcaption>\n{content}\n</figure>"
+
+
+def _side(parts: list[str]) -> str:
+    parts = [part for part in parts if part]
+    return '<div class="side">\n' + "\n".join(parts) + "\n</div>" if parts else ""
 
 
 def _scrolling(lines: list[str]) -> str:

@@ -146,12 +146,12 @@ def _cell(summary: Summary, row: int, head: Head) -> Cell:
 
 def _marked(cell: Cell, spec: TableSpec, escape: Callable[[str], str], marks: tuple[str, str]) -> str:
     """The cell's text with its number, not its spread, marked."""
-    number, plus_minus, spread = spell_cell(cell).partition(" ± ")
+    number, _, spread = spell_cell(cell).partition(" ± ")
     mark = mark_of(cell, spec)
     number = escape(number)
     if mark:
         number = marks[mark == "second"].format(number)
-    return number + escape(plus_minus + spread)
+    return f"{number} {escape('± ' + spread)}" if spread else number
 
 
 def _starts_group(spec: TableSpec, r: int) -> bool:
