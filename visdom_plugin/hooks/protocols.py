@@ -28,10 +28,17 @@ class RayBounds(NamedTuple):
 
 @runtime_checkable
 class SamplerHook(Protocol):
-    """What NeRF methods call where they would use near and far."""
+    """What NeRF methods call where they would use near and far.
+
+    In training, a method takes no samples outside the bounds, and none at all where near = far: what lies beyond
+    has no part in colour, opacity and gradient. All levels of a hierarchical sampler are inside.
+    """
 
     def bound(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> RayBounds:
-        """Bounds inside [near, far]. Pure, without gradient, any leading shape.
+        """Bounds inside [near, far], in the directions' dtype and on their device.
+
+        Pure, without gradient, any leading shape: nothing handed in is changed, the same question has the same
+        answer, no random numbers are drawn.
 
         Args:
             origins, directions: (..., 3) world frame.
@@ -42,7 +49,10 @@ class SamplerHook(Protocol):
 
 @runtime_checkable
 class GaussianHook(Protocol):
-    """What Gaussian splatting methods call at the start, for the loss, and after each step."""
+    """What Gaussian splatting methods call at the start, for the loss, and after each step.
+
+    Random numbers come from the generators handed in alone, so that the same question has the same answer.
+    """
 
     def initial_points(self, n: int, generator: Generator) -> tuple[Tensor, Tensor]:
         """At most `n` starting points: xyz (M, 3) world frame and rgb (M, 3) in [0, 1]."""

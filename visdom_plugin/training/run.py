@@ -156,11 +156,28 @@ def build(
         began = time.monotonic()
         hull = config.hull.carve(*views.silhouettes())
         hull_s = time.monotonic() - began
-    vd = getattr(config, "vd", None)
-    hooks = [vd.build(hull, views)] if vd is not None and vd.enabled else []
+    hooks = make_hooks(config, hull, views)
     method = preset.load()(config)
     method.setup(views, hooks, hull=hull, device=device, seed=seed)
     return method, hull, hull_s
+
+
+def make_hooks(config: Any, hull: Any, views: Views) -> list[Any]:
+    """The hook that the config's field `vd` asks for, in a list; none where it is off or not there.
+
+    Raises:
+        ConfigError: when it is asked for and there is no hull to go with it.
+    """
+    vd = getattr(config, "vd", None)
+    if vd is None or not vd.enabled:
+        return []
+    if hull is None:
+        raise ConfigError(
+            "the visible-domain hook is asked for, but no hull to go with it",
+            where="--method.vd.enabled",
+            todo="start from the variant +vd, which has both",
+        )
+    return [vd.build(hull, views)]
 
 
 def restore(

@@ -1,0 +1,58 @@
+import torch
+from torch.nn.functional import grid_sample
+
+from visdom_plugin.methods import radiance
+from visdom_plugin.nerf.frame import frame_of
+from visdom_plugin.nerf.optimiser import FieldOptimiser
+from visdom_plugin.nerf.volume import composite, weights_from_density
+
+
+class Field:
+    def __init__(self, config):
+        self.config, self.total_steps, self.radius = config, config.steps, config.radius
+
+    def setup(self, views, hooks, *, hull, device, seed):
+        self.hooks, self.device, self.frame = hooks, device, frame_of(views.cameras)
+        self.grid = torch.nn.Parameter(torch.zeros(1, 4, *3 * [self.config.resolution], device=device))
+        self.optimiser = FieldOptimiser([({"grid": self.grid}, 0.0)], betas=(0.9, 0.99), eps=1e-15)
+
+    def pixels_per_step(self, step):
+        return self.config.rays
+
+    def look(self, points):
+        at = (points.to(self.device) / self.radius).flip(-1).reshape(1, -1, 1, 1, 3)
+        values = grid_sample(self.grid, at, padding_mode="border", align_corners=True)[0, :, :, 0, 0]
+        return torch.exp(20 * values[0] - 1), (10 * values[1:]).T.sigmoid()
+
+    def trace(self, origins, directions, background, hooks):
+        nearest = -(self.frame.to_local(origins) * directions).sum(-1).float()
+        near, far = (nearest - self.radius).clamp_min(0), nearest + self.radius
+        o, d, near, far, _ = radiance.bound_rays(origins, directions, near, far, self.frame, hooks)
+        t = near[:, None] + (far - near)[:, None] * torch.linspace(0, 1, self.config.samples + 1).to(near)
+        density, rgb = self.look(o[:, None] + (t[:, 1:] + t[:, :-1])[..., None] / 2 * d[:, None])
+        weights, _ = weights_from_density(density.reshape(len(t), -1), t)
+        return composite(weights, rgb.reshape(len(t), -1, 3), t, background)
+
+    def train_step(self, batch, step):
+        white = torch.ones(3, device=self.device)
+        rgb, alpha, _ = self.trace(batch.origins, batch.directions, white, self.hooks)
+        colour = (rgb - radiance.photograph_on(white, batch, alpha)).square().mean()
+        return {"colour": colour, "mask": self.config.mask_weight * radiance.silhouette_loss(alpha, batch)}
+
+    def optimise(self, step):
+        self.optimiser.step(learning_rate=0.02)
+
+    def render(self, camera, background):
+        hooks = self.hooks if self.config.vd.hull_at_inference else []
+        return radiance.render_image(camera, lambda *x: self.trace(*x, background, hooks), self.frame, 20000)
+
+    def state_dict(self):
+        return self.optimiser.state_dict()
+
+    def load_state_dict(self, state):
+        self.optimiser.load_state_dict(state)
+
+    def export(self, folder):
+        density, colour = lambda x: self.look(x)[0], lambda x, _: self.look(x)[1]
+        mesh = radiance.mesh_density(density, colour, self.frame, self.radius)
+        return radiance.export_mesh(folder / "mesh.ply", mesh)

@@ -1,0 +1,29 @@
+"""What a stranger reads when a promise is not kept."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+
+def require(holds: bool, what: str, promise: Callable[..., Any] | type, todo: str) -> None:
+    """Fails the check, without a traceback into this package, unless it holds.
+
+    Args:
+        what: what was seen, one sentence.
+        promise: the class or function in whose documentation it is promised.
+        todo: what to do.
+    """
+    if not holds:
+        pytest.fail(
+            f"{what}\n  promised in: {promise.__module__}.{promise.__qualname__} ({_place(promise)})\n"
+            f"  what to do: {todo}",
+            pytrace=False,
+        )
+
+
+def _place(promise: Callable[..., Any] | type) -> str:
+    return f"{inspect.getsourcefile(promise)}:{inspect.getsourcelines(promise)[1]}"
