@@ -6,6 +6,10 @@ here because nerfstudio looks for plugins while it builds its own, so that these
 
 from __future__ import annotations
 
+import _codecs
+
+import numpy as np
+import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
@@ -20,6 +24,12 @@ from nerfstudio.plugins.types import MethodSpecification
 from visdom_plugin.hosts.nerfstudio.dataparser import VisdomDataParserConfig
 from visdom_plugin.hosts.nerfstudio.fields import InstantNgpVdConfig, NerfactoVdConfig
 from visdom_plugin.hosts.nerfstudio.splats import SplatfactoVdConfig
+
+# Since 2.6 torch loads tensors and plain data only, and nerfstudio's own checkpoints hold their learning rates as
+# numpy numbers. Allowing these is what ns-eval, ns-viewer and --load-dir need, for every method.
+torch.serialization.add_safe_globals(
+    [np.core.multiarray.scalar, np.dtype, type(np.dtype(np.float64)), _codecs.encode]
+)
 
 
 def _group(lr: float, lr_final: float | None = None, steps: int = 200_000, **warm_up) -> dict:
