@@ -300,8 +300,9 @@ def test_missing_or_broken_pictures_leave_the_strip_out(tmp_path):
     record, _ = make_run(tmp_path, [(40, 60)], np.random.default_rng(2))
     assert read_strip(tmp_path / "nowhere", record, 99) is None
     assert read_strip(tmp_path, {"metrics": {}}, 99) is None
-    (tmp_path / "renders" / "test_sheet.png").write_bytes(b"no picture")
-    assert read_strip(tmp_path, record, 99) is None
+    for content in (b"no picture", b""):
+        (tmp_path / "renders" / "test_sheet.png").write_bytes(content)
+        assert read_strip(tmp_path, record, 99) is None
 
 
 def test_the_page_holds_its_pictures_and_curves(tmp_path):

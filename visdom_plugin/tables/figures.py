@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from html import escape
 from pathlib import Path
 
@@ -38,12 +39,18 @@ def read_curve(run_dir: Path) -> np.ndarray | None:
 
     Lines that cannot be read are left out.
     """
+    path = Path(run_dir) / "log.jsonl"
     try:
-        lines = (Path(run_dir) / "log.jsonl").read_text(encoding="utf-8", errors="replace").splitlines()
+        return _read_log(path, path.stat().st_mtime_ns)
     except OSError:
         return None
+
+
+@lru_cache(maxsize=8192)
+def _read_log(path: Path, written: int) -> np.ndarray | None:
+    """`written`: the file's age, so that a driver that writes its table many times reads each log once."""
     points, last = [], 0
-    for line in lines:
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
             row = json.loads(line)
             step, value = int(row["step"]), row.get("psnr")

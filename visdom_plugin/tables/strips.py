@@ -6,13 +6,14 @@ import base64
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 log = logging.getLogger(__name__)
 
 ERROR_FULL = 0.5
-"""Mean absolute difference over channels, of images in [0, 1], that the error picture's brightest colour shows."""
+"""The difference that the brightest colour of `draw_error` stands for, of images in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +37,15 @@ def read_strip(run_dir: Path, record: Mapping[str, Any], height_px: int) -> Stri
     Returns:
         None where the run has no pictures, or they cannot be read.
     """
+    import cv2
+
     try:
-        return _read(Path(run_dir) / "renders", record, height_px)
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        folder, names = Path(run_dir) / "renders", tuple(record["data"]["test"])
+        written = (folder / "test_sheet.png").stat().st_mtime_ns
+        name, *files = _read(folder, names, height_px, written)
+        found = record.get("metrics", {}).get("per_view", {}).get(name, {}).get("psnr")
+        return Strip(name, found, *files)
+    except (OSError, ValueError, KeyError, TypeError, IndexError, cv2.error) as error:
         log.debug("no pictures of %s: %r", run_dir, error)
         return None
 
@@ -48,43 +55,32 @@ def data_uri(png: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
-def _read(folder: Path, record: Mapping[str, Any], height_px: int) -> Strip:
+@lru_cache(maxsize=1024)
+def _read(
+    folder: Path, names: tuple[str, ...], height_px: int, written: int
+) -> tuple[str, bytes, bytes, bytes]:
+    """The view's name and three PNG files. A driver writes its table many times: `written` is the sheet's age."""
     import cv2
 
-    from visdom_plugin.training.pictures import SHEET_ROWS, cut_sheet, picture_names, shown_on_sheet
+    from visdom_plugin.training import pictures
 
-    names = list(record["data"]["test"])
-    shown = shown_on_sheet(len(names))
+    shown = pictures.shown_on_sheet(len(names))
     column = len(shown) // 2
-    name = names[shown[column]]
-    size = _load(folder / "test" / f"{picture_names(names)[shown[column]]}.png").shape[:2]
-    sheet = _load(folder / "test_sheet.png")
-    truth, render = (cut_sheet(sheet, column, row, SHEET_ROWS, size) for row in (0, 1))
+    file = pictures.picture_names(names)[shown[column]]
+    size = pictures.read_png(folder / "test" / f"{file}.png").shape[:2]
+    sheet = pictures.read_png(folder / "test_sheet.png")
+    truth, render = (pictures.cut_sheet(sheet, column, r, pictures.SHEET_ROWS, size) for r in (0, 1))
     scale = min(1.0, height_px / truth.shape[0])
     small = [max(1, round(n * scale)) for n in truth.shape[1::-1]]
     truth, render = (cv2.resize(p, small, interpolation=cv2.INTER_AREA) for p in (truth, render))
-    difference = cv2.absdiff(truth, render).astype("float32").mean(axis=2)
-    grey = (difference / ERROR_FULL).clip(0, 255).round().astype("uint8")
-    error = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)
-    found = record.get("metrics", {}).get("per_view", {}).get(name, {}).get("psnr")
-    return Strip(name, found, *(_encode(p) for p in (truth, render, error)))
-
-
-def _load(path: Path):
-    """(H, W, 3) uint8, in OpenCV's order of channels."""
-    import cv2
-    import numpy as np
-
-    picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise ValueError(f"{path} is no picture")
-    return picture
+    drawn = (truth, render, pictures.draw_error(truth, render))
+    return names[shown[column]], *(_encode(picture) for picture in drawn)
 
 
 def _encode(picture) -> bytes:
     import cv2
 
-    ok, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    ok, data = cv2.imencode(".png", picture[..., ::-1])
     if not ok:
         raise ValueError("OpenCV could not encode a picture")
     return data.tobytes()

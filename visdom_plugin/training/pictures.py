@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from visdom_plugin.training.files import appearing, write_bytes
-from visdom_plugin.training.metrics import quantise
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SHEET_WIDTH_PX = 260
 """Width of one picture on the contact sheet."""
@@ -33,7 +34,9 @@ def picture_names(names: Sequence[str]) -> list[str]:
 
 def to_bytes(image: Tensor) -> np.ndarray:
     """(H, W, 3) in [0, 1] to uint8, clamped and rounded."""
-    return (quantise(image) * 255).round().to(torch.uint8).numpy()
+    from visdom_plugin.training.metrics import quantise
+
+    return (quantise(image) * 255).round().byte().numpy()
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
