@@ -110,7 +110,7 @@ def run_spec(spec: TableSpec, options: Options) -> int:
         return 0
     for place in (folder, runs):
         remove_old_parts(place)
-    overview = Overview(quiet=options.quiet, workers=options.workers or 1)
+    overview = Overview(quiet=options.quiet)
     results = run_plan(
         made,
         _make_executor(spec, options, folder, overview.tick),

@@ -19,13 +19,12 @@ EVERY = 30.0
 class Overview:
     """Shows jobs done, running and failed, and the time left. As a context manager; silent when quiet."""
 
-    def __init__(self, *, quiet: bool = False, stream: TextIO | None = None, workers: int = 1):
+    def __init__(self, *, quiet: bool = False, stream: TextIO | None = None):
         """
         Args:
             stream: where to write, by default stderr.
-            workers: jobs at a time, for the time left.
         """
-        self.quiet, self.workers = quiet, max(workers, 1)
+        self.quiet = quiet
         self.stream = sys.stderr if stream is None else stream
         self._bar: Any = None
         self._plan: Plan | None = None
@@ -116,7 +115,8 @@ class Overview:
         if outcome.status in ("finished", "failed"):
             return 1.0
         steps = self._plan.tasks[run_dir].steps
-        return min(read_step(run_dir) / steps, 1.0) if outcome.status == "running" and steps else 0.0
+        # After the last step comes the evaluation.
+        return 0.9 * min(read_step(run_dir) / steps, 1.0) if outcome.status == "running" and steps else 0.0
 
     def _estimate(self, shares: dict[Path, float], share: float) -> float | None:
         """Seconds left: by what finished runs of the same method, or of any, took on average; before the first, by
@@ -137,7 +137,7 @@ class Overview:
         for run_dir, share in shares.items():
             values = took.get(self._plan.tasks[run_dir].method, every)
             left += (1 - share) * sum(values) / len(values)
-        return left / self.workers
+        return left / max(1, sum(o.status == "running" for o in self._known.values()))
 
 
 def spell_seconds(seconds: float) -> str:
