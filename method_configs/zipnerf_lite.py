@@ -21,7 +21,7 @@ QUICK = ZipNerfConfig(
     # The object, all there is to see, lies between the cameras.
     far=3.0,
     samples=(32, 32, 16),
-    test_samples=(32, 24, 12),
+    test_samples=(24, 24, 12),
     coarse_grid=HashLayout(4, 1, base_resolution=16, max_resolution=128, log2_table_size=15),
     fine_grid=HashLayout(5, 1, base_resolution=16, max_resolution=256, log2_table_size=15),
     grid=HashLayout(6, 4, base_resolution=16, max_resolution=512, log2_table_size=15),
@@ -37,7 +37,7 @@ QUICK = ZipNerfConfig(
 )
 
 MASK = {"mask_weight": 0.1, "background": "random"}
-VD = MASK | {"hull": VisibleDomain(dilate_px=1), "vd": SamplerConfig(enabled=True), "samples": (16, 16, 12)}
+VD = MASK | {"hull": VisibleDomain(dilate_px=1), "vd": SamplerConfig(enabled=True), "samples": (16, 16, 10)}
 
 
 def _preset(suffix: str, description: str, changes: dict) -> Preset:

@@ -195,3 +195,5 @@ def test_sinusoids_in_their_order():
         [unit, *(torch.sin(unit * 2**k) for k in range(4)), *(torch.cos(unit * 2**k) for k in range(4))], -1
     )
     torch.testing.assert_close(directions.encode_sinusoids(unit), expected)
+    # No octave leaves the direction itself.
+    torch.testing.assert_close(directions.encode_sinusoids(unit, 0), unit)

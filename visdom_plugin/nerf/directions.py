@@ -47,7 +47,8 @@ def encode_sinusoids(directions: Tensor, degree: int = 4) -> Tensor:
         (..., 3 + 6 degree).
     """
     directions = directions.detach()
-    phases = torch.cat([directions * 2**k for k in range(degree)], -1)
+    frequencies = 2.0 ** torch.arange(degree, dtype=directions.dtype, device=directions.device)
+    phases = (frequencies[:, None] * directions[..., None, :]).flatten(-2)
     return torch.cat([directions, torch.sin(phases), torch.cos(phases)], -1)
 
 
