@@ -26,6 +26,15 @@ WORDS = ["--leave-one-out", "method:fake", "--method.steps", "12", "--out", "loo
 DOMAIN = VisibleDomain(resolution=24, k=2)
 
 
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    """The hull that renders are measured against is coarse here, too."""
+    from visdom_plugin.training import evaluate, run
+
+    carve = evaluate.carve_reference
+    monkeypatch.setattr(run, "carve_reference", lambda views: carve(views, DOMAIN))
+
+
 @pytest.fixture
 def fold(fakes, monkeypatch):
     """fold(scene, folder, method, config): all runs of leave-one-out, and their summary."""

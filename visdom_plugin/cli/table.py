@@ -30,6 +30,8 @@ class Options:
 
     Finished runs are reused, interrupted ones go on, failed ones keep their error in the table and do not stop the
     rest. Writes table.md, .csv, .tex and .html whenever a run ends. Exits with 1 when runs failed.
+
+    The table `ablation` is made for one method and your scene: visdom-table ablation method:ingp --data DIR
     """
 
     table: tyro.conf.Positional[str | None] = None
@@ -78,15 +80,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _main(argv: Sequence[str]) -> int:
+    if "ablation" in argv[:1] or any(word.startswith("method:") for word in argv):
+        return _ablation(argv)
     options = tyro.cli(Options, args=list(argv), prog="visdom-table")
+    if options.table == "ablation":
+        return _ablation(argv)
     if options.table is None:
         for name, path in list_tables().items():
             spec, editions = load_table(name), list_editions(path)
             also = f"  (editions: {', '.join(editions)})" if editions else ""
             sys.stdout.write(f"{name:<20} {spec.title}{also}\n")
+        sys.stdout.write(f"{'ablation':<20} One method of your choice in five variants, on your scene\n")
         return 0
     spec = change_spec(load_table(options.table, options.edition), options)
     return run_spec(spec, options)
+
+
+def _ablation(argv: Sequence[str]) -> int:
+    from visdom_plugin.cli.ablation import ablation
+
+    return ablation(argv)
 
 
 def run_spec(spec: TableSpec, options: Options) -> int:
