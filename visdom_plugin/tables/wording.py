@@ -79,7 +79,7 @@ def describe_runs(spec: TableSpec, summary: Summary) -> str:
     parts = [f"{n} {_WORDS.get(status, status)}" for status, n in sorted(counts.items())]
     records = [outcome.record for _, outcome in summary.outcomes if outcome.record]
     facts = {
-        "budget": {str(r.get("budget")) for r in records if r.get("budget")} or {spec.budget},
+        "budget": {str(r["budget"]) for r in records if r.get("budget") and spec.kind == "train"},
         "seeds": [", ".join(map(str, spec.seeds))],
         "device": {str(r.get("device")) for r in records if r.get("device")},
         "threads": {str(r.get("threads")) for r in records if r.get("threads")},
