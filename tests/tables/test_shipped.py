@@ -60,7 +60,8 @@ def test_rows_and_columns_name_places_that_the_paper_has(name, edition, tmp_path
                 sweep = name == "mask_dilation" and edition
                 assert sweep or any(x.paper is not None for x in cells), (row.label, column.label)
                 assert all(x.mean is None and x.status == "waiting" for x in cells)
-    assert any(c.paper is not None for c in summary.cells) or (name == "hull_chamfer" and edition)
+    if edition is None:
+        assert any(c.paper is not None for c in summary.cells)
     assert numbers.values and write_all(Results(spec), tmp_path)
 
 
@@ -92,7 +93,7 @@ def test_an_edition_of_the_main_table_has_every_variant_of_every_method():
     rows = {row.method for row in load_table("main", "smoke").rows}
     methods = ("ingp", "zipnerf-lite", "3dgs-go", "corgs-lite")
     assert rows == {m + v for m in methods for v in ("", "+mask", "+vd")}
-    assert load_table("main", "scenes").seeds == (0, 1, 2)
+    assert load_table("main", "captures").seeds == (0, 1, 2)
 
 
 def test_the_papers_layouts_are_kept():
