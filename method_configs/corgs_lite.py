@@ -1,7 +1,7 @@
 """CoR-GS lite and its variants: what each sets, side by side.
 
 `full` is the published schedule for captures all round a scene. `quick` is the same method on 400 steps, with
-pseudo views between the cameras: an ellipse through four of them leaves too much to what nobody has seen.
+pseudo views between the cameras: few cameras rarely stand all round, and where they do the ellipse is no better.
 """
 
 from __future__ import annotations

@@ -153,7 +153,8 @@ class CorgsConfig(GaussianSetConfig):
     """After `densify_from`, Gaussians without a neighbour in the other set are removed on every n-th step; 0
     never."""
     co_prune_extents: float = 0.05
-    """How far the nearest neighbour may be, as a fraction of the scene extent."""
+    """How far the nearest neighbour may be, as a fraction of the scene extent. Much less than the default eats
+    thin parts; much more never meets a stray near the object."""
     co_prune_world: float | None = None
     """The same in units of the scene; wins over the fraction. The authors: 20 for mip-NeRF 360, 10 for DTU, 5 for
     LLFF, in the units COLMAP happened to choose."""
