@@ -134,6 +134,7 @@ def test_groups_are_compared_within_themselves_and_unfinished_cells_with_nothing
     assert [c.rank for c in rank_cells(cells, ["a", "b", "a", "a"])] == [2, None, 1, None]
 
 
+@settings(deadline=None)
 @given(st.floats(-1e6, 1e6))
 def test_one_value_has_no_spread(value):
     assert sample_std([value]) is None and sample_std([]) is None
@@ -145,7 +146,7 @@ def test_a_table_of_one_seed_has_no_spread():
     assert all(c.std is None and c.whole for c in summarise(results).cells)
 
 
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=6), st.floats(-100, 100), st.floats(-10, 10))
 def test_spread_ignores_shifts_and_follows_scale(values, shift, scale):
     spread = sample_std(values)

@@ -331,6 +331,7 @@ def test_curves_are_read_from_whole_lines(tmp_path):
     assert figures.read_curve(tmp_path / "nowhere") is None
 
 
+@settings(deadline=None)
 @given(st.floats(-1e5, 1e5), st.floats(-1e5, 1e5))
 def test_axes_hold_their_numbers(a, b):
     low, high, ticks = figures._nice(min(a, b), max(a, b))

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from visdom_plugin.tables.layout import MEAN, read_layout
+from visdom_plugin.tables.layout import MEAN, Layout, read_layout
 from visdom_plugin.tables.measures import MEASURES, Measure, find_measure
 from visdom_plugin.tables.paper import find_number, load_numbers
 from visdom_plugin.tables.results import Job, Outcome, Results
@@ -77,6 +77,7 @@ class Summary:
     cells: tuple[Cell, ...]
     scenes: tuple[SceneValue, ...]
     outcomes: tuple[tuple[Job, Outcome], ...]
+    layout: Layout
 
     def cell(self, row: int, column: int, views: int | str, measure: str) -> Cell:
         """The cell of a place."""
@@ -120,7 +121,7 @@ def summarise(results: Results) -> Summary:
     if layout.best != "none":
         groups = [row.group if layout.best == "group" else "" for row in spec.rows]
         cells = rank_cells(cells, groups)
-    return Summary(tuple(cells), tuple(scenes), tuple(jobs[key] for key in sorted(jobs)))
+    return Summary(tuple(cells), tuple(scenes), tuple(jobs[key] for key in sorted(jobs)), layout)
 
 
 def rank_cells(cells: Sequence[Cell], groups: Sequence[str]) -> list[Cell]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from visdom_plugin.tables.layout import read_layout
+from visdom_plugin.tables.layout import Layout
 from visdom_plugin.tables.measures import MEASURES
 from visdom_plugin.tables.spec import TableSpec
 from visdom_plugin.tables.summary import Cell, Summary
@@ -31,9 +31,8 @@ def spell_paper(cell: Cell) -> str:
     return text if cell.difference is None else f"{text} ({measure.spell(cell.difference, signed=True)})"
 
 
-def mark_of(cell: Cell, spec: TableSpec) -> str:
+def mark_of(cell: Cell, layout: Layout) -> str:
     """ "best", "second" or nothing, as the layout marks it."""
-    layout = read_layout(spec)
     if cell.rank == 1:
         return "best"
     return "second" if cell.rank == 2 and layout.second else ""
@@ -53,7 +52,7 @@ def heading(spec: TableSpec) -> str:
 
 def describe_numbers(spec: TableSpec, summary: Summary) -> list[str]:
     """How the numbers are to be read, a sentence each."""
-    layout = read_layout(spec)
+    layout = summary.layout
     lines = ["Views are averaged per scene, then scenes, then seeds."]
     if any(c.std is not None for c in summary.cells):
         lines.append(f"± is the sample standard deviation over {len(spec.seeds)} seeds.")

@@ -13,7 +13,7 @@ from visdom_plugin.tables.figures import (
     read_curve,
     swatch,
 )
-from visdom_plugin.tables.layout import MEAN, Block, arrange, list_views, read_layout, spell_views
+from visdom_plugin.tables.layout import MEAN, Block, Layout, arrange, list_views, spell_views
 from visdom_plugin.tables.measures import MEASURES
 from visdom_plugin.tables.page_style import STYLE
 from visdom_plugin.tables.results import Job, Outcome
@@ -71,14 +71,14 @@ def _table(spec: TableSpec, summary: Summary, block: Block) -> str:
                 f'<tr class="group"><th colspan="{wide}" scope="colgroup">{escape(row.group)}</th></tr>'
             )
         cells = [summary.cell(r, h.column, h.views, h.measure) for h in block.heads]
-        words = "".join(_cell(spec, cell, paper) for cell in cells)
+        words = "".join(_cell(cell, summary.layout, paper) for cell in cells)
         lines.append(f'<tr><th scope="row">{escape(row.label)}</th>{words}</tr>')
     return _scrolling([*lines, "</tbody>"])
 
 
-def _cell(spec: TableSpec, cell: Cell, paper: bool) -> str:
+def _cell(cell: Cell, layout: Layout, paper: bool) -> str:
     number, _, spread = spell_cell(cell).partition(" ± ")
-    mark = mark_of(cell, spec)
+    mark = mark_of(cell, layout)
     kind = mark or ("" if cell.whole else "partial" if cell.n else "absent")
     text = f"<strong>{escape(number)}</strong>" if mark == "best" else escape(number)
     if spread:
@@ -104,7 +104,7 @@ def _footer(spec: TableSpec, summary: Summary) -> str:
 def _place(spec: TableSpec, summary: Summary, c: int, views: int, unfolded: bool, many: bool) -> str:
     """Everything behind one column and number of views."""
     parts = [_side([_spread(spec, summary, c, views, m) for m in spec.metrics])]
-    if read_layout(spec).pictures:
+    if summary.layout.pictures:
         jobs = [(j, o) for j, o in summary.outcomes if (j.column, j.views) == (c, views)]
         parts.append(_curves(spec, jobs))
         parts.append(_pictures(spec, c, jobs, MANY_HEIGHT_PX if many else HEIGHT_PX))

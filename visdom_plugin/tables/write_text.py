@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from visdom_plugin.tables.layout import Block, Head, arrange
+from visdom_plugin.tables.layout import Block, Head, Layout, arrange
 from visdom_plugin.tables.spec import TableSpec
 from visdom_plugin.tables.summary import Cell, Summary
 from visdom_plugin.tables.wording import (
@@ -109,7 +109,7 @@ def _md_block(spec: TableSpec, summary: Summary, block: Block) -> str:
         words = [_md(row.label)]
         for head, there in zip(block.heads, paper, strict=True):
             cell = _cell(summary, r, head)
-            words.append(_marked(cell, spec, _md, ("**{}**", "_{}_")))
+            words.append(_marked(cell, summary.layout, _md, ("**{}**", "_{}_")))
             words += [spell_paper(cell)] if there else []
         lines.append(_pipe(words))
     return "\n".join(lines)
@@ -127,7 +127,7 @@ def _tex_block(spec: TableSpec, summary: Summary, block: Block) -> list[str]:
                 _tex_line([rf"\textit{{{_tex(row.group)}}}"], block),
             ]
         cells = [_cell(summary, r, h) for h in block.heads]
-        ours = [_marked(c, spec, _tex, (r"\textbf{{{}}}", r"\underline{{{}}}")) for c in cells]
+        ours = [_marked(c, summary.layout, _tex, (r"\textbf{{{}}}", r"\underline{{{}}}")) for c in cells]
         lines.append(_tex_line([_tex(row.label), *ours], block))
         theirs = [spell_paper(c) for c in cells]
         if any(theirs):
@@ -144,10 +144,10 @@ def _cell(summary: Summary, row: int, head: Head) -> Cell:
     return summary.cell(row, head.column, head.views, head.measure)
 
 
-def _marked(cell: Cell, spec: TableSpec, escape: Callable[[str], str], marks: tuple[str, str]) -> str:
+def _marked(cell: Cell, layout: Layout, escape: Callable[[str], str], marks: tuple[str, str]) -> str:
     """The cell's text with its number, not its spread, marked."""
     number, _, spread = spell_cell(cell).partition(" ± ")
-    mark = mark_of(cell, spec)
+    mark = mark_of(cell, layout)
     number = escape(number)
     if mark:
         number = marks[mark == "second"].format(number)
