@@ -1,10 +1,14 @@
 """Nerfstudio's frame and back: laws of the similarity, without nerfstudio."""
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import visdom_plugin
 from visdom_plugin.cameras import Cameras, look_at_camera, look_at_point, rays_of
 from visdom_plugin.hosts.nerfstudio.frame import Similarity, frame_of
 
@@ -115,3 +119,14 @@ def test_frame_moves_with_the_capture():
     assert torch.allclose(one[:, 2], two[:, 2], atol=1e-6)
     gram = [p[:, :, 3] @ p[:, :, 3].mT for p in (one, two)]
     assert torch.allclose(*gram, atol=1e-6)
+
+
+def test_nerfstudio_is_imported_in_its_room_alone():
+    root = Path(visdom_plugin.__file__).parents[1]
+    sources = [
+        p for name in ("visdom_plugin", "datamodules", "method_configs") for p in (root / name).rglob("*.py")
+    ]
+    room = root / "visdom_plugin/hosts/nerfstudio"
+    imports = re.compile(r"^\s*(import|from) (nerfstudio|visdom_plugin\.hosts\.nerfstudio)\b", re.M)
+    assert [p for p in sources if room not in p.parents and imports.search(p.read_text("utf-8"))] == []
+    assert any(imports.search(p.read_text("utf-8")) for p in room.glob("*.py"))
