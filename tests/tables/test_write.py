@@ -91,7 +91,7 @@ def test_scene_lines_say_what_each_job_gave(tmp_path):
 
 
 @settings(max_examples=15, deadline=None)
-@given(tables(), st.text(max_size=12))
+@given(tables(), st.text(max_size=12) | st.just("a\r\n\x00b"))
 def test_files_do_not_break_on_what_users_type(results, typed):
     spec = results.spec
     rows = (replace(spec.rows[0], label=HOSTILE + typed, group=typed), *spec.rows[1:])

@@ -183,6 +183,12 @@ def _write_csv(names: Sequence[str], lines: Sequence[dict[str, object]]) -> str:
     writer = csv.DictWriter(file, names, lineterminator="\n")
     writer.writeheader()
     for line in lines:
-        # repr holds every digit of a float.
-        writer.writerow({k: repr(v) if isinstance(v, float) else v for k, v in line.items()})
+        writer.writerow({name: _csv_word(value) for name, value in line.items()})
     return file.getvalue()
+
+
+def _csv_word(value: object) -> object:
+    """Every digit of a float; text without control characters, of which csv quotes line feeds alone."""
+    if isinstance(value, float):
+        return repr(value)
+    return re.sub(r"[\x00-\x08\x0b-\x1f]", " ", value) if isinstance(value, str) else value
