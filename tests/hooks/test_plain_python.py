@@ -61,6 +61,8 @@ def test_arrays_bound_like_tensors(ball):
     assert all(torch.equal(a, b) for a, b in zip(wanted, got, strict=True))
     whole = sampler(np.array([0, 0, 0]), np.array([2, -1, 0]), 0, 9)
     assert whole.near.dtype == torch.float64 and bool(whole.hit)
+    with pytest.raises(ConfigError, match="rays have"):
+        sampler(origins, directions, torch.zeros(5, 40, 1), 9.0)
 
 
 @pytest.mark.parametrize("dtype", [*HALVES, torch.float64])

@@ -17,6 +17,18 @@ DEFAULT_EPSILON_HULL_RADII = 0.1
 """About 0.03 camera distances for an object that fills half the picture; FINDINGS.md has the sweep."""
 
 
+def _limit(value, like: Tensor) -> Tensor:
+    value = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    try:
+        return value.expand(like.shape)
+    except RuntimeError as error:
+        raise ConfigError(
+            f"near or far has shape {tuple(value.shape)}, the rays have {tuple(like.shape)}",
+            where="VisDomSampler.bound",
+            todo="pass a number, or one value per ray without a last dimension of size 1: near[..., 0]",
+        ) from error
+
+
 class VisDomSampler:
     """Confines a ray's samples to a band around the hull.
 
@@ -101,6 +113,9 @@ class VisDomSampler:
         Returns:
             RayBounds of shape (...), in the directions' dtype, on their device; near <= far everywhere. In half
             precision the band is rounded outwards.
+
+        Raises:
+            ConfigError: when near or far does not fit the rays' shape.
         """
         origins, directions = (torch.as_tensor(x).detach() for x in (origins, directions))
         if not directions.is_floating_point():
@@ -116,10 +131,7 @@ class VisDomSampler:
         with torch.no_grad():
             crossing = cast(self.hull, origins, directions)
             first = crossing.t_first
-            near, far = (
-                torch.as_tensor(x, dtype=first.dtype, device=first.device).expand(first.shape)
-                for x in (near, far)
-            )
+            near, far = (_limit(x, first) for x in (near, far))
             last = first if self.interval == "first_hit" else crossing.t_last
             epsilon = self.epsilon_world / directions.norm(dim=-1).to(first)
             begin, end = torch.maximum(near, first - epsilon), torch.minimum(far, last + epsilon)

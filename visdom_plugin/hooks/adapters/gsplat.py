@@ -136,7 +136,7 @@ def draw_opacity(params, camera: Cameras) -> Tensor:
 
 
 def info_of(render: Render) -> dict[str, Any]:
-    """gsplat's `info` of a view that `visdom_plugin.splat.rasterise` drew, for gsplat's strategies on the CPU."""
+    """What gsplat 1.5's strategies want as `info`, of a view that `visdom_plugin.splat.rasterise` drew."""
     own = render.info
     return {
         "means2d": _Means2d(own["means2d"]),
