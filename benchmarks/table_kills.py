@@ -3,8 +3,8 @@
 python benchmarks/table_kills.py --kills 10 [--steps 20] [--seed S]
 
 One table is made in one go. Then the same table is made again, while after random times the driver and one of its
-workers get SIGKILL in turn; a killed driver is started again at once. table.csv and table.md must be the same byte for
-byte. When a table is finished before all kills are spent, another one begins.
+workers get SIGKILL in turn; a killed driver is started again at once. table.csv and table.md must be the same byte
+for byte. When a table is finished before all kills are spent, another one begins.
 """
 
 from __future__ import annotations
