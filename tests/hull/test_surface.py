@@ -83,6 +83,9 @@ def test_volume_inside_and_shared(ball):
         assert found["iou"] == pytest.approx(small / large, abs=0.03)
         assert found["covered"] == pytest.approx(min(radius**3, 1.0), abs=0.03)
         assert found["volume"] / found["target_volume"] == pytest.approx(radius**3, rel=0.03)
+    ball = Hull.from_grid(x**2 + y**2 + z**2 < 1, bounds)
+    itself = overlap(ball, *ball.to_mesh())
+    assert 0.97 < itself["iou"] <= itself["covered"] <= 1
     half = overlap(Hull.from_grid(x > 0, bounds), vertices, faces)
     assert half["covered"] == pytest.approx(0.5, abs=0.01)
     assert overlap(Hull.from_grid(x > 0, bounds), vertices, faces[1:])["iou"] is None

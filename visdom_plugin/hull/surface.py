@@ -88,7 +88,8 @@ def overlap(hull: Hull, vertices: np.ndarray, faces: np.ndarray) -> dict[str, fl
         return {"volume": hull.volume, "target_volume": None, "iou": None, "covered": None}
     target = abs(enclosed_volume(vertices, faces))
     inside = fill_mesh(vertices, faces, hull.bounds, hull.shape) & hull.occupancy
-    shared = float(np.count_nonzero(inside)) * hull.volume / max(hull.voxels, 1)
+    # Counted in whole voxels, the part can come out a little larger than the whole.
+    shared = min(float(np.count_nonzero(inside)) * hull.volume / max(hull.voxels, 1), target)
     return {
         "volume": hull.volume,
         "target_volume": target,
