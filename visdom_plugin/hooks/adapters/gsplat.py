@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable
+from importlib.metadata import version
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -136,11 +137,17 @@ def draw_opacity(params, camera: Cameras) -> Tensor:
 
 
 def info_of(render: Render) -> dict[str, Any]:
-    """What gsplat 1.5's strategies want as `info`, of a view that `visdom_plugin.splat.rasterise` drew."""
+    """What gsplat's strategies want as `info`, of a view that `visdom_plugin.splat.rasterise` drew.
+
+    Radii are (1, N, 2) from gsplat 1.5 on, (1, N) before.
+    """
     own = render.info
+    radii = own["radii"]
+    if radii.ndim == 2 and version("gsplat").startswith("1.4."):
+        radii = radii.amax(-1)
     return {
         "means2d": _Means2d(own["means2d"]),
-        "radii": own["radii"][None],
+        "radii": radii[None],
         "width": own["width"],
         "height": own["height"],
         "n_cameras": 1,

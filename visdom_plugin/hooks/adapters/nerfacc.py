@@ -5,12 +5,14 @@ Nothing here imports nerfacc: the estimator is the caller's.
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from visdom_plugin.errors import PluginError
 from visdom_plugin.hooks.protocols import SamplerHook
 from visdom_plugin.hull.hull import Hull
 
@@ -54,7 +56,16 @@ def confine(estimator: Any, hull: Hull, *, margin: float = 0.0) -> int:
 
     Returns:
         How many cells stay open.
+
+    Raises:
+        PluginError: for nerfacc before 0.5.3, whose updates look at closed cells, too.
     """
+    package = type(estimator).__module__.partition(".")[0]
+    if package == "nerfacc" and _release(version(package)) < (0, 5, 3):
+        raise PluginError(
+            f"the updates of nerfacc {version(package)} open closed cells again",
+            todo="pip install 'nerfacc>=0.5.3', or bound rays alone, with ray_limits",
+        )
     total = np.zeros(np.add(hull.shape, 1), np.int64)
     total[1:, 1:, 1:] = hull.occupancy.cumsum(0, dtype=np.int64).cumsum(1).cumsum(2)
     reached = []
@@ -79,3 +90,8 @@ def confine(estimator: Any, hull: Hull, *, margin: float = 0.0) -> int:
     estimator.occs[closed.flatten()] = -1.0
     estimator.binaries &= ~closed
     return int((~closed).sum())
+
+
+def _release(text: str) -> tuple[int, ...]:
+    """ "0.5.3+cu118" as (0, 5, 3)."""
+    return tuple(int(part) for part in text.partition("+")[0].split(".")[:3] if part.isdecimal())
