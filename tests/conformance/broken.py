@@ -179,7 +179,7 @@ class Moody(OwnSampler):
 
     def changed(self, hook, origins, directions, near, far):
         asked_again = torch.equal(Moody.last, directions)
-        Moody.last = directions.clone()
+        Moody.last = torch.zeros(0) if asked_again else directions.clone()
         near, far, hit = hook.bound(origins, directions, near, far)
         return RayBounds(near, near + 0.99 * (far - near) if asked_again else far, hit)
 
