@@ -37,7 +37,7 @@ QUICK = ZipNerfConfig(
 )
 
 MASK = {"mask_weight": 0.1, "background": "random"}
-VD = MASK | {"hull": VisibleDomain(dilate_px=1), "vd": SamplerConfig(enabled=True), "samples": (16, 16, 10)}
+VD = MASK | {"hull": VisibleDomain(dilate_px=1), "vd": SamplerConfig(enabled=True), "samples": (12, 12, 14)}
 
 
 def _preset(suffix: str, description: str, changes: dict) -> Preset:
