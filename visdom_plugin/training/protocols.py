@@ -77,5 +77,5 @@ class Method(Protocol):
         ...
 
     def export(self, folder: Path) -> list[Path]:
-        """Writes the reconstruction into the folder, in standard formats and the input frame; returns the files."""
+        """Writes the reconstruction into the folder, in standard formats and the input frame; returns files."""
         ...
