@@ -22,7 +22,7 @@ td.partial,td.absent{background:var(--off);color:var(--soft)}
 pre{white-space:pre-wrap;background:var(--off);padding:.6rem;border-left:3px solid var(--line)}
 figure{margin:1rem 0}
 .side{display:flex;flex-wrap:wrap;align-items:flex-start;gap:0 2.5rem}
-.side figure{flex:1 1 30rem} .side .wide{max-width:100%}
+.side figure{flex:1 1 30rem} .side .wide{max-width:100%} .side caption{white-space:normal}
 figcaption{font-weight:600;margin-bottom:.3rem}
 svg.figure{width:100%;max-width:44rem;height:auto;display:block}
 svg text{fill:var(--ink)}
