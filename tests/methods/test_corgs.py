@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from datamodules.manager import DataManager
 from datamodules.synthetic import SyntheticConfig, make_scene
 from method_configs.corgs_lite import PRESETS, QUICK
+from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.cameras import Cameras, look_at_camera, look_at_point, project
 from visdom_plugin.errors import SceneError
 from visdom_plugin.hooks.configs import RegularizerConfig
@@ -50,29 +51,7 @@ def hull(scene):
 
 
 def start(scene, hull, config=SMALL, hooks=None, seed=0):
-    method = CorgsLite(config)
-    hooks = [config.vd.build(hull, scene.train)] if hooks is None else hooks
-    method.setup(scene.train, hooks, hull=hull, device=CPU, seed=seed)
-    return method
-
-
-def advance(method, scene, steps):
-    data, history = DataManager(scene.train, seed=0), []
-    for step in steps:
-        losses = method.train_step(data.view_batch(step), step)
-        total = sum(losses.values())
-        total.backward()
-        method.optimise(step)
-        history.append(float(total.detach()))
-    return history
-
-
-def copy_of(method):
-    return {k: v.clone() for k, v in method.state_dict().items()}
-
-
-def same(a, b):
-    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+    return set_up(CorgsLite, config, scene, hull, hooks, seed)
 
 
 class Watcher:

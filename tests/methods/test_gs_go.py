@@ -5,16 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from datamodules.manager import DataManager
 from datamodules.synthetic import SyntheticConfig, make_scene
 from method_configs.gs_go import PRESETS, QUICK
+from tests.methods.short_runs import advance, set_up
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.gaussian_set import scene_extent
 from visdom_plugin.methods.gs_go import GsGo
 from visdom_plugin.methods.initial_cloud import mean_masked_colour
 
-CPU = torch.device("cpu")
 SMALL = replace(
     QUICK,
     steps=60,
@@ -42,21 +41,7 @@ def hull(scene):
 
 
 def start(scene, hull, config=SMALL, hooks=None, seed=0):
-    method = GsGo(config)
-    hooks = [config.vd.build(hull, scene.train)] if hooks is None else hooks
-    method.setup(scene.train, hooks, hull=hull, device=CPU, seed=seed)
-    return method
-
-
-def advance(method, scene, steps):
-    data, history = DataManager(scene.train, seed=0), []
-    for step in steps:
-        losses = method.train_step(data.view_batch(step), step)
-        total = sum(losses.values())
-        total.backward()
-        method.optimise(step)
-        history.append(float(total.detach()))
-    return history
+    return set_up(GsGo, config, scene, hull, hooks, seed)
 
 
 def test_it_learns(scene, hull):

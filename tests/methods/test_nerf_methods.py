@@ -10,6 +10,7 @@ import trimesh
 from datamodules.manager import DataManager
 from datamodules.synthetic import SyntheticConfig, make_scene
 from method_configs import ingp, zipnerf_lite
+from tests.methods.short_runs import advance, copy_of, set_up
 from visdom_plugin import registry
 from visdom_plugin.cameras import rays_of
 from visdom_plugin.errors import ConfigError
@@ -22,7 +23,6 @@ from visdom_plugin.methods.zipnerf_lite import ZipNerfLite
 from visdom_plugin.nerf.frame import Frame
 from visdom_plugin.nerf.hash_layout import HashLayout
 
-CPU = torch.device("cpu")
 HULL = VisibleDomain(resolution=48, dilate_px=1)
 SMALL = {
     Ingp: replace(
@@ -71,26 +71,7 @@ def hull(scene):
 
 
 def start(method_class, scene, hull, config=None, hooks=None, seed=0):
-    config = config or SMALL[method_class]
-    method = method_class(config)
-    hooks = [config.vd.build(hull, scene.train)] if hooks is None else hooks
-    method.setup(scene.train, hooks, hull=hull, device=CPU, seed=seed)
-    return method
-
-
-def advance(method, scene, steps):
-    data, history = DataManager(scene.train, seed=0), []
-    for step in steps:
-        losses = method.train_step(data.pixel_batch(step, method.pixels_per_step(step)), step)
-        total = sum(losses.values())
-        total.backward()
-        method.optimise(step)
-        history.append(float(total.detach()))
-    return history
-
-
-def copy_of(method):
-    return {k: v.clone() for k, v in method.state_dict().items()}
+    return set_up(method_class, config or SMALL[method_class], scene, hull, hooks, seed)
 
 
 @pytest.fixture(scope="module", params=list(SMALL), ids=lambda c: c.__name__)
