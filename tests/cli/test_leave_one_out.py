@@ -16,6 +16,7 @@ from datamodules.splits import choose, every_eighth
 from tests.training import fake
 from visdom_plugin.cli import evaluate
 from visdom_plugin.cli.leave_one_out import check_views, run_folds, summarise
+from visdom_plugin.cli.options import Common
 from visdom_plugin.errors import ConfigError, EmptyHullError, SceneError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.scene import hold_out
@@ -45,12 +46,10 @@ def fold(fakes, monkeypatch):
 
     def call(scene, folder, preset=fake.PRESET, config=None, **keywords):
         config = config or fake.FakeConfig(steps=12, hull=DOMAIN)
-        common = SimpleNamespace(
-            quiet=True, overwrite=False, seed=0, checkpoint_seconds=30, budget="quick", data=None
-        )
+        missing = keywords.get("missing_masks", "error")
+        common = Common(quiet=True, budget="quick", views=len(scene.train), missing_masks=missing)
         request = SimpleNamespace(preset=preset, config=config, common=common)
-        asked = {"missing_masks": keywords.get("missing_masks", "error"), "views": len(scene.train)}
-        return run_folds(request, scene, Path(folder), asked, device="cpu")
+        return run_folds(request, scene, Path(folder), device="cpu")
 
     assert registry.find("fake") is fake.PRESET
     return call

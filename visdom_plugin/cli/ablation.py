@@ -158,7 +158,7 @@ def _results(spec: TableSpec, options: AblationOptions) -> Results:
 def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
     """The same table with every training view held out in turn; the views stand as the table's scenes."""
     from visdom_plugin.cli import leave_one_out as folds
-    from visdom_plugin.cli.options import Common, Request, choose_budget, read_options, resolve_device
+    from visdom_plugin.cli.options import Common, Request, choose_budget, resolve_device
     from visdom_plugin.cli.report import say
     from visdom_plugin.tables.write import write_all
     from visdom_plugin.training.rundir import read_record
@@ -193,7 +193,7 @@ def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
         if i in wanted:
             if not options.quiet:
                 say(f"{row.label}: {row.method}")
-            summary = folds.run_folds(request, scene, folder, read_options(common), device=device)
+            summary = folds.run_folds(request, scene, folder, device=device)
         for name in names:
             run_dir = folder / summary["runs"].get(name, "")
             outcome = Outcome("waiting")

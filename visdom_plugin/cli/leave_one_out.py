@@ -52,8 +52,7 @@ def leave_one_out(argv: Sequence[str]) -> int:
     from visdom_plugin.cli.report import say
     from visdom_plugin.cli.scenes import open_scene
 
-    asked = options.read_options(common)
-    scene = open_scene(common.data, **asked, fill=False, hold_out=False)
+    scene = open_scene(common.data, **options.read_options(common), fill=False, hold_out=False)
     check_views(scene, request.config)
     folder = common.out or default_folder(scene, request.preset.name, common.seed)
     if not common.quiet:
@@ -63,7 +62,7 @@ def leave_one_out(argv: Sequence[str]) -> int:
             f"{request.preset.name}{note} on {scene.name}: {count} runs, each without one view, {request.note}"
         )
         say(f"results: {folder}")
-    summary = run_folds(request, scene, folder, asked, device=device)
+    summary = run_folds(request, scene, folder, device=device)
     if not common.quiet:
         show_summary(summary, folder)
     return FAILURES if summary["failed"] else 0
@@ -114,25 +113,21 @@ def check_views(scene: Any, config: Any) -> None:
         )  # fmt: skip
 
 
-def run_folds(
-    request: options.Request, scene: Any, folder: Path, asked: dict[str, Any], *, device: str
-) -> dict[str, Any]:
+def run_folds(request: options.Request, scene: Any, folder: Path, *, device: str) -> dict[str, Any]:
     """Makes, or finds, the run without each view, and writes what they come to.
 
     Args:
         scene: with all views, masks not filled in yet.
-        asked: how the scene was read.
 
     Returns:
         leave_one_out.json's content.
     """
     from visdom_plugin.cli.report import say
-    from visdom_plugin.cli.scenes import make_data_manager
+    from visdom_plugin.cli.train import train_as_asked
     from visdom_plugin.scene import hold_out
     from visdom_plugin.training.files import write_json
     from visdom_plugin.training.missing_masks import fill_masks
     from visdom_plugin.training.pictures import picture_names, write_png
-    from visdom_plugin.training.run import train
     from visdom_plugin.training.settings import as_plain
 
     common = request.common
@@ -144,24 +139,8 @@ def run_folds(
         if not common.quiet:
             say(f"{number} of {len(held)}: without {name}")
         try:
-            fold = fill_masks(hold_out(scene, i), asked["missing_masks"])
-            records[name] = train(
-                request.preset.name,
-                request.config,
-                fold,
-                data_manager=make_data_manager,
-                run_dir=folder / names[i],
-                device=device,
-                seed=common.seed,
-                quiet=common.quiet,
-                overwrite=common.overwrite,
-                checkpoint_seconds=common.checkpoint_seconds,
-                budget=common.budget,
-                request={
-                    "path": None if common.data is None else str(common.data.expanduser().resolve()),
-                    **asked,
-                },
-            )
+            fold = fill_masks(hold_out(scene, i), common.missing_masks)
+            records[name] = train_as_asked(request, fold, folder / names[i], device)
         except EmptyHullError as error:
             failed[name] = str(error)
             log.warning("without %s nothing can be made: %s", name, error)

@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from visdom_plugin.cli import errors, options
 
@@ -25,12 +26,10 @@ def _train(argv: Sequence[str]) -> None:
 
     from visdom_plugin.cli.check import warn_of_faults
     from visdom_plugin.cli.report import say, show_result
-    from visdom_plugin.cli.scenes import make_data_manager, open_scene
+    from visdom_plugin.cli.scenes import open_scene
     from visdom_plugin.scene import describe_masks
-    from visdom_plugin.training.run import train
 
-    asked = options.read_options(common)
-    scene = open_scene(common.data, **asked)
+    scene = open_scene(common.data, **options.read_options(common))
     folder = common.out or default_run_dir(scene.name, len(scene.train), request.preset.name, common.seed)
     if not common.quiet:
         data = "the built-in scene" if common.data is None else common.data
@@ -41,12 +40,27 @@ def _train(argv: Sequence[str]) -> None:
             say(f"data: {line}")
         say(f"run directory: {folder}")
         warn_of_faults(scene)
-    record = train(
+    record = train_as_asked(request, scene, folder, device)
+    if not common.quiet:
+        if record["already_finished"]:
+            say("this run is finished already; nothing was done (train again with --overwrite)")
+        elif record["resumed_from"] is not None:
+            say(f"resumed after step {record['resumed_from']}")
+        show_result(record, folder)
+
+
+def train_as_asked(request: options.Request, scene, run_dir: Path, device: str) -> dict[str, Any]:
+    """`training.run.train` with what the command line says; run.json's content."""
+    from visdom_plugin.cli.scenes import make_data_manager
+    from visdom_plugin.training.run import train
+
+    common = request.common
+    return train(
         request.preset.name,
         request.config,
         scene,
         data_manager=make_data_manager,
-        run_dir=folder,
+        run_dir=run_dir,
         device=device,
         seed=common.seed,
         quiet=common.quiet,
@@ -55,15 +69,9 @@ def _train(argv: Sequence[str]) -> None:
         budget=common.budget,
         request={
             "path": None if common.data is None else str(common.data.expanduser().resolve()),
-            **asked,
+            **options.read_options(common),
         },
     )
-    if not common.quiet:
-        if record["already_finished"]:
-            say("this run is finished already; nothing was done (train again with --overwrite)")
-        elif record["resumed_from"] is not None:
-            say(f"resumed after step {record['resumed_from']}")
-        show_result(record, folder)
 
 
 def default_run_dir(scene: str, views: int, method: str, seed: int) -> Path:
