@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,8 @@ def test_the_snippets_of_a_page_run(page, tmp_path, monkeypatch):
     host = HOSTS.get(page.name)
     if host and importlib.util.find_spec(host) is None:
         pytest.skip(f"{host} is not installed")
+    if host == "nerfacc" and version(host) == "0.5.2":
+        pytest.skip("the page is for nerfacc 0.5.3; nerfstudio has 0.5.2")
     monkeypatch.chdir(tmp_path)
     namespace = {"__name__": "snippet"}
     if page.name == "README.md":
