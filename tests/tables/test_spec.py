@@ -5,7 +5,7 @@ import yaml
 
 from tests.tables.matrix import table
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables.spec import Column, load_table, parse_table
+from visdom_plugin.tables.spec import Column, _flatten, load_table, nest, parse_table
 
 CONTENT = {
     "title": "Small",
@@ -90,3 +90,14 @@ def test_files_and_editions_that_are_not_there_are_named(file, tmp_path):
         file.write_text(text)
         with pytest.raises(ConfigError, match=r"small\.yaml"):
             load_table(file)
+
+
+@pytest.mark.parametrize("paths", [["hull", "hull.k"], ["hull.k", "hull"]])
+def test_a_setting_and_what_is_inside_it_do_not_go_together(paths):
+    with pytest.raises(ConfigError, match="settings name both"):
+        nest(dict.fromkeys(paths, 3), "row 'a'")
+
+
+def test_nested_settings_are_flat_again():
+    flat = {"steps": 3, "hull.k": 2, "hull.bounds.lower": [0, 0, 0], "vd.missing": None}
+    assert _flatten(nest(flat, "row 'a'")) == flat

@@ -19,7 +19,7 @@ from visdom_plugin.cli.options import WORD
 from visdom_plugin.cli.table import Options
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.tables.results import Job, Outcome, Results
-from visdom_plugin.tables.spec import Column, Row, TableSpec
+from visdom_plugin.tables.spec import Column, Row, TableSpec, nest
 
 log = logging.getLogger(__name__)
 
@@ -228,14 +228,8 @@ def _request(row: Row, budget: str, common: Any, note: str, make: Any) -> Any:
     from visdom_plugin.training.settings import from_plain
 
     preset = registry.find(row.method)
-    nested: dict[str, Any] = {}
-    for path, value in row.settings.items():
-        *parents, last = path.split(".")
-        inner = nested
-        for parent in parents:
-            inner = inner.setdefault(parent, {})
-        inner[last] = value
-    config = from_plain(getattr(preset, budget), nested, f"row {row.label!r}")
+    where = f"row {row.label!r}"
+    config = from_plain(getattr(preset, budget), nest(row.settings, where), where)
     return make(preset, config, common, note)
 
 

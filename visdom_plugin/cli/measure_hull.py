@@ -53,8 +53,8 @@ def _measure(argv: Sequence[str]) -> None:
     from visdom_plugin.cli.train import default_run_dir
     from visdom_plugin.training.hull_run import carve_run
 
-    asked = options.read_options(common)
-    scene = with_target(open_scene(common.data, **asked, fill=False), common.data, request.config.target)
+    scene = open_scene(common.data, **options.read_options(common), fill=False)
+    scene = with_target(scene, common.data, request.config.target)
     folder = common.out or default_run_dir(scene.name, len(scene.train), METHOD, common.seed)
     record = carve_run(
         request.config,
@@ -63,10 +63,7 @@ def _measure(argv: Sequence[str]) -> None:
         seed=common.seed,
         overwrite=common.overwrite,
         budget=common.budget,
-        request={
-            "path": None if common.data is None else str(common.data.expanduser().resolve()),
-            **asked,
-        },
+        request=options.describe_reading(common),
     )
     if not common.quiet:
         say(f"run directory: {folder}")

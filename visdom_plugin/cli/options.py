@@ -165,6 +165,12 @@ def read_options(options: Any) -> dict[str, Any]:
     return found
 
 
+def describe_reading(common: Common) -> dict[str, Any]:
+    """How the scene was asked for, as run.json notes it, so that it can be loaded again."""
+    path = None if common.data is None else str(common.data.expanduser().resolve())
+    return {"path": path, **read_options(common)}
+
+
 def dump(request: Request) -> str:
     """The YAML that `--config` reads back to the same request."""
     import yaml

@@ -67,10 +67,7 @@ def train_as_asked(request: options.Request, scene, run_dir: Path, device: str) 
         overwrite=common.overwrite,
         checkpoint_seconds=common.checkpoint_seconds,
         budget=common.budget,
-        request={
-            "path": None if common.data is None else str(common.data.expanduser().resolve()),
-            **options.read_options(common),
-        },
+        request=options.describe_reading(common),
     )
 
 

@@ -19,7 +19,7 @@ from typing import Any
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.tables.protocol import Fact, facts_of_settings, refuse_mixture
 from visdom_plugin.tables.results import Job, Outcome
-from visdom_plugin.tables.spec import BUILT_IN, Column, Row, TableSpec
+from visdom_plugin.tables.spec import BUILT_IN, Column, Row, TableSpec, nest
 from visdom_plugin.tables.state import beside
 from visdom_plugin.training.files import write_bytes
 from visdom_plugin.training.settings import as_plain, from_plain
@@ -181,15 +181,7 @@ def hash_folder(folder: Path) -> str:
 
 def _resolve(spec: TableSpec, row: Row, workshop: Workshop) -> Resolved | None:
     where = f"row {row.label!r} of {spec.source}"
-    nested: dict[str, Any] = {}
-    for path, value in row.settings.items():
-        *parents, last = path.split(".")
-        inner = nested
-        for parent in parents:
-            inner = inner.setdefault(parent, {})
-            if not isinstance(inner, dict):
-                raise ConfigError(f"settings name both {parent!r} and {path!r}", where=where)
-        inner[last] = value
+    nested = nest(row.settings, where)
     try:
         found = workshop.resolve(spec.kind, row.method, row.budget or spec.budget)
         if found is None:

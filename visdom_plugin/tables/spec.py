@@ -253,6 +253,26 @@ def _flatten(settings: dict[str, Any], path: str = "") -> dict[str, Any]:
     return flat
 
 
+def nest(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Dotted paths to nested mappings, as `settings.from_plain` takes them.
+
+    Raises:
+        ConfigError: when one path goes on behind another one's value.
+    """
+    nested: dict[str, Any] = {}
+    for path, value in settings.items():
+        *parents, last = path.split(".")
+        inner = nested
+        for parent in parents:
+            inner = inner.setdefault(parent, {})
+            if not isinstance(inner, dict):
+                raise ConfigError(f"settings name both {parent!r} and {path!r}", where=where)
+        if isinstance(inner.get(last), dict):
+            raise ConfigError(f"settings name both {path!r} and what is inside it", where=where)
+        inner[last] = value
+    return nested
+
+
 def _parse(
     template: Any,
     content: dict[str, Any],
