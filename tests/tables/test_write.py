@@ -4,6 +4,8 @@ import csv
 import io
 import json
 import re
+import shutil
+import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -115,7 +117,7 @@ def check_latex(text):
         depth += 1 if brace == "{" else -1
         assert depth >= 0
     assert depth == 0
-    assert re.sub(r"\$\\(pm|uparrow|downarrow)\$", "", text).replace(r"\$", "").count("$") == 0
+    assert re.sub(r"\$(\\(pm|uparrow|downarrow)|-)\$", "", text).replace(r"\$", "").count("$") == 0
     stack = []
     for kind, name in re.findall(r"\\(begin|end)\{(\w+\*?)\}", text):
         if kind == "begin":
@@ -165,13 +167,27 @@ def test_hostile_words_arrive_as_they_were():
     assert re.sub(r"\\(.)", r"\1", label).startswith(f"| {HOSTILE.replace(chr(92), '')} |"[:20])
 
 
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
+def test_latex_compiles_it(tmp_path):
+    rows = [HOSTILE, "−0.5 or -0.5, not a-0", "third"]
+    spec = replace(make_spec(rows=rows, columns=3), title=HOSTILE, notes=(HOSTILE,))
+    table = to_latex(*both(make_results(spec, statuses=STATUSES)))
+    assert "$-$0.5 or $-$0.5, not a-0" in table
+    head = r"\documentclass{article}\usepackage[T1]{fontenc}\usepackage{booktabs}\begin{document}"
+    (tmp_path / "page.tex").write_text(head + "\n" + table + r"\end{document}", encoding="utf-8")
+    command = ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "page.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=120)
+    assert done.returncode == 0, done.stdout.decode(errors="replace")[-2000:]
+    assert (tmp_path / "page.pdf").stat().st_size > 10_000
+
+
 @settings(max_examples=15, deadline=None)
 @given(tables())
 def test_every_writer_prints_every_number(results):
     spec, summary = both(results)
     texts = [
         to_markdown(spec, summary),
-        to_latex(spec, summary).replace(r"$\pm$", "±"),
+        to_latex(spec, summary).replace(r"$\pm$", "±").replace("$-$", "-"),
         to_html(spec, summary),
     ]
     for cell in summary.cells:

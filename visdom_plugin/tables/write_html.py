@@ -126,7 +126,8 @@ def _spread(spec: TableSpec, summary: Summary, c: int, views: int, measure: str)
             rows.append(Dots(row.label, tuple(value for _, value in cell.seeds), cell.mean, cell.paper))
     if not rows:
         return ""
-    title = f"{MEASURES[measure].title}: seeds (dots), mean (bar), paper (diamond)"
+    paper = ", paper (diamond)" if any(dots.paper is not None for dots in rows) else ""
+    title = f"{MEASURES[measure].title}: seeds (dots), mean (bar){paper}"
     return _figure(title, draw_spread(rows, MEASURES[measure]))
 
 

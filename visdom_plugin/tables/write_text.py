@@ -37,6 +37,7 @@ _TEX = {
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
     "±": r"$\pm$",
+    "−": "$-$",
     "↑": r"$\uparrow$",
     "↓": r"$\downarrow$",
 } | {c: f"\\{c}" for c in "_&%#$"}
@@ -164,7 +165,8 @@ def _md(text: str) -> str:
 
 
 def _tex(text: str) -> str:
-    return "".join(_TEX.get(c, c) for c in " ".join(text.split()))
+    """Escaped, with a minus, not a hyphen, before numbers."""
+    return "".join(_TEX.get(c, c) for c in re.sub(r"(?<!\w)-(?=\d)", "−", " ".join(text.split())))
 
 
 def _pipe(words: Sequence[str]) -> str:
