@@ -93,6 +93,7 @@ def read(root: Path, request: Request) -> Capture:
         tuple(frames),
         calibrate,
         hold_out(there),
+        (f"{folder}calibration.csv", "aabbs.csv"),
         shrunk=scale,
         units="metres",
         source=source,

@@ -71,6 +71,8 @@ class Capture:
     """Cameras of some frames, by position; raises SceneError for what is wrong with these."""
     pools: splits.Pools
     """The layout's own split."""
+    calibration_files: tuple[str, ...]
+    """Files below the root that frames, cameras and split were read from; need not exist."""
     indexed: bool = False
     """Whether index files must exist."""
     photographs: str | None = None
@@ -88,6 +90,38 @@ class Capture:
     """Of the scene; by default the root's."""
 
 
+class Chosen(NamedTuple):
+    """The views of a request, and where their pixels lie."""
+
+    split: splits.Split
+    folder: str | None
+    """Of the photographs."""
+    factor: float
+    """How much smaller the photographs' files are than the cameras say."""
+    files: list[ViewFiles]
+    """Of the training views, then of the test views."""
+
+
+def choose_files(capture: Capture, request: Request) -> Chosen:
+    """The views of a request and their files, none of which is opened.
+
+    Raises:
+        SceneError: for views, folders or masks that are not there.
+        ConfigError: for a list given by hand that does not fit the data.
+    """
+    if not capture.frames:
+        raise SceneError(
+            "the scene has no photographs", where=capture.root, cause="a scene that was copied only in part"
+        )
+    _check_names(capture, request)
+    names = [frame.name for frame in capture.frames]
+    split = splits.choose(capture.root, names, request, capture.pools, indexed=capture.indexed)
+    wanted = [*split.train, *split.test]
+    folder, factor = _photographs(capture, request.downscale / capture.shrunk, request)
+    masks = assign_masks(capture, wanted, request)
+    return Chosen(split, folder, factor, [_files(capture, i, folder, masks[i], request) for i in wanted])
+
+
 def open_capture(capture: Capture, request: Request) -> Scene:
     """The scene of a request.
 
@@ -100,29 +134,18 @@ def open_capture(capture: Capture, request: Request) -> Scene:
         SceneError: for every fault of the data.
         ConfigError: for a list given by hand that does not fit the data.
     """
-    frames = capture.frames
-    if not frames:
-        raise SceneError(
-            "the scene has no photographs", where=capture.root, cause="a scene that was copied only in part"
-        )
-    _check_names(capture, request)
-    names = [frame.name for frame in frames]
-    chosen = splits.choose(capture.root, names, request, capture.pools, indexed=capture.indexed)
-    wanted = [*chosen.train, *chosen.test]
-    calibration = capture.calibrate(wanted)
-    downscale = request.downscale / capture.shrunk
-    folder, factor = _photographs(capture, downscale, request)
-    masks = assign_masks(capture, wanted, request)
-    files = [_files(capture, i, folder, masks[i], request) for i in wanted]
-    reader = ViewReader(files, calibration, factor, downscale, capture, request)
-    n = len(chosen.train)
+    split, folder, factor, files = choose_files(capture, request)
+    names = [frame.name for frame in capture.frames]
+    calibration = capture.calibrate([*split.train, *split.test])
+    reader = ViewReader(files, calibration, factor, request.downscale / capture.shrunk, capture, request)
+    n = len(split.train)
     loaded = spread_out(reader.read, range(n))
     later = LaterViews(lambda i: reader.read(n + i), spread_out(reader.inspect, range(n, len(files))))
     sizes = [(v.image.shape[1], v.image.shape[0]) for v in loaded] + [v.size for v in later.inspected]
     cameras = calibration.cameras.resized(*torch.tensor(sizes).reshape(-1, 2).unbind(1))
-    train = _views(cameras[:n], loaded, [names[i] for i in chosen.train])
+    train = _views(cameras[:n], loaded, [names[i] for i in split.train])
     bent = any(d is not None for d in calibration.distortions[n:])
-    test = _later_views(cameras[n:], later, [names[i] for i in chosen.test], bent=bent)
+    test = _later_views(cameras[n:], later, [names[i] for i in split.test], bent=bent)
     _warn_inverted(train)
     name = printable(capture.name or capture.root.resolve().name)
     source = {
@@ -131,13 +154,13 @@ def open_capture(capture: Capture, request: Request) -> Scene:
         "views": n,
         "downscale": float(request.downscale),
         "images": folder,
-        "split": chosen.rule,
+        "split": split.rule,
         "train": list(train.names),
         "test": list(test.names),
         **capture.source,
-        "hashes": {**chosen.hashes, **hash_views(train)},
+        "hashes": {**split.hashes, **hash_views(train)},
     }
-    notes = (f"layout {capture.layout}: {chosen.rule}", *capture.notes, *_note_soft(loaded))
+    notes = (f"layout {capture.layout}: {split.rule}", *capture.notes, *_note_soft(loaded))
     return Scene(name, train, test, capture.units, source, notes=notes)
 
 

@@ -67,6 +67,8 @@ class Model:
     folder: Path
     cameras: dict[int, Intrinsics]
     images: tuple[Registered, ...]
+    files: tuple[str, ...] = ()
+    """What it was read from, below the scene's folder."""
 
 
 def find_model(root: Path) -> str | None:
@@ -97,7 +99,8 @@ def read_model(root: Path, folder: str, *, outside: bool = False) -> Model:
         paths = [inside(root, name, outside=outside) for name in names]
         if all(path.is_file() for path in paths):
             cameras, images = (read_inside(root, name, outside=outside) for name in names)
-            return Model(root / folder, read_cameras(cameras, paths[0]), tuple(read_images(images, paths[1])))
+            registered = tuple(read_images(images, paths[1]))
+            return Model(root / folder, read_cameras(cameras, paths[0]), registered, tuple(names))
     raise SceneError(
         "no COLMAP model: neither cameras.bin with images.bin nor cameras.txt with images.txt",
         where=root / folder,

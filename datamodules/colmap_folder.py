@@ -94,6 +94,7 @@ def read_capture(
         frames,
         calibrate,
         splits.every_eighth(len(frames)),
+        model.files,
         indexed=indexed,
         photographs="images",
         mask_folder=mask_folder,

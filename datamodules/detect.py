@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -81,10 +82,7 @@ def load(
         ConfigError: for an option out of range.
     """
     request = Request(views=views, downscale=downscale, test=test, **reading)
-    if data_format is not None and data_format not in FORMATS:
-        raise ConfigError(
-            f"unknown data format {data_format!r}", where="--data-format", todo=f"one of {', '.join(FORMATS)}"
-        )
+    _check_format(data_format)
     if path is None:
         from datamodules.synthetic import SyntheticConfig, make_scene
 
@@ -92,10 +90,18 @@ def load(
         return make_scene(
             SyntheticConfig(downscale=downscale, seed=seed, **wanted, **({} if test else {"test_views": 0}))
         )
-    request.check()
+    from datamodules.capture import open_capture
+
+    with opening(path) as root:
+        return open_capture(read_capture(root, data_format, request), request)
+
+
+@contextmanager
+def opening(path: str | Path) -> Iterator[Path]:
+    """The folder of that name; what goes wrong while it is read is told as SceneError."""
     root = find_folder(path)
     try:
-        return _open(root, data_format, request)
+        yield root
     except RecursionError as error:
         raise SceneError("the data is nested too deeply", where=root) from error
     except OSError as error:
@@ -139,16 +145,32 @@ def recognise(root: Path) -> dict[str, str]:
     return {name: reason for name, reason in found.items() if name not in covered}
 
 
-def _open(root: Path, data_format: str | None, request: Request) -> Scene:
-    from datamodules.capture import open_capture
+def read_capture(root: Path, data_format: str | None, request: Request) -> Capture:
+    """What the layout's reader makes of the folder, before any pixel is read.
 
+    Args:
+        data_format: the layout; None recognises it.
+
+    Raises:
+        SceneError: for an unknown or ambiguous layout, and for a calibration that is damaged.
+        ConfigError: for an option out of range.
+    """
+    _check_format(data_format)
+    request.check()
     if data_format is None:
         data_format = _only_reading(root)
     form = FORMATS[data_format]
     read: Callable[[Path, Request], Capture] = getattr(
         import_module(f"datamodules.{form.module}"), form.reader
     )
-    return open_capture(read(root, request), request)
+    return read(root, request)
+
+
+def _check_format(data_format: str | None) -> None:
+    if data_format is not None and data_format not in FORMATS:
+        raise ConfigError(
+            f"unknown data format {data_format!r}", where="--data-format", todo=f"one of {', '.join(FORMATS)}"
+        )
 
 
 def _only_reading(root: Path) -> str:

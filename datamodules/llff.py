@@ -100,6 +100,7 @@ def read_capture(
         frames,
         calibrate,
         splits.every_eighth(len(frames)),
+        (file,),
         photographs="images",
         mask_folder=mask_folder,
         notes=(f"poses of {file}: the principal point is taken to be the centre of each image",),

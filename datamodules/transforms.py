@@ -226,6 +226,7 @@ def make_capture(
         ordered,
         calibrate,
         pools,
+        tuple(file.path.name for file in files),
         photographs="images" if all(f.image.startswith("images/") for f in ordered) else None,
         mask_folder=None if pointed else "masks",
         notes=tuple(notes),

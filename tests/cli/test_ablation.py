@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.datamodules.prepared_writer import write_prepared
 from tests.training import fake
 from visdom_plugin import registry
 from visdom_plugin.cli import table
@@ -108,6 +109,25 @@ def test_one_command_makes_table_and_figure_and_the_next_reuses_them(variants, c
     assert capsys.readouterr() == ("", "")
     assert before == {p: p.stat().st_mtime_ns for p in before}
     assert np.array_equal(figure, cv2.imread("t/ablation.png"))
+
+
+def test_a_table_in_the_scenes_own_folder_finds_its_runs_again(variants, tmp_path, monkeypatch, capsys):
+    write_prepared(fake.tiny_scene(), tmp_path / "mine")
+    monkeypatch.chdir(tmp_path / "mine")
+    words = ["ablation", "method:fake", "--data", ".", "--views", "4", "--set", "steps=3"]
+    shown = []
+    monkeypatch.setattr(
+        "visdom_plugin.cli.ablation_figure.draw_figure",
+        lambda results, *others: (shown.append(results), draw_figure(results, *others))[1],
+    )
+    assert table.main(words) == 0
+    assert [o.status for o in shown[0].outcomes.values()] == ["finished"] * 5
+    made = sorted(Path().glob("tables/*/runs/*/run.json"))
+    assert len(made) == 5
+    capsys.readouterr()
+    assert table.main([*words, "--dry-run"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[:5]] == ["reuse"] * 5 and "0 of them" in lines[-1]
 
 
 def _without_tests(monkeypatch):

@@ -5,9 +5,8 @@ import shutil
 import pytest
 
 from tests.tables.matrix import make, table, workshop
-from visdom_plugin.cli.options import Common
-from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables.jobs import WHOLE, hash_folder, plan
+from visdom_plugin.errors import ConfigError, SceneError
+from visdom_plugin.tables.jobs import plan
 
 
 @pytest.fixture
@@ -65,23 +64,42 @@ def test_every_fact_of_a_run_is_in_its_name(tmp_path, changes):
 
 def test_changed_data_make_another_run(tmp_path, scenes):
     before = _run_dir(tmp_path, _real(), {"mip": scenes})
-    assert _run_dir(tmp_path) != _run_dir(tmp_path, built_in_hash=lambda: "redrawn")
-    (scenes / "kitchen/.DS_Store").write_text("x")
+    assert _run_dir(tmp_path) != _run_dir(tmp_path, hash_data=lambda *given: "redrawn")
+    (scenes / "kitchen/stray.txt").write_text("x")
     assert before == _run_dir(tmp_path, _real(), {"mip": scenes})
     (scenes / "kitchen/poses.json").write_text("Kitchen")
     assert before != _run_dir(tmp_path, _real(), {"mip": scenes})
 
 
-def test_the_hash_sees_names_sizes_and_the_ends_of_large_files(tmp_path):
-    large = tmp_path / "a.bin"
-    large.write_bytes(bytes(WHOLE + 10))
-    hashes = {hash_folder(tmp_path)}
-    for content in (bytes(WHOLE + 11), b"x" + bytes(WHOLE + 10), bytes(WHOLE + 10) + b"x"):
-        large.write_bytes(content)
-        hashes.add(hash_folder(tmp_path))
-    large.rename(tmp_path / "b.bin")
-    hashes.add(hash_folder(tmp_path))
-    assert len(hashes) == 5
+def test_data_are_hashed_as_the_job_reads_them(tmp_path, scenes):
+    asked = []
+    spec = _real(scenes=["kitchen"], views=[4, 6], downscale=2, data_format="llff", reading={"frame": 3})
+    hash_data = lambda *given: str(asked.append(given))  # noqa: E731
+    made = plan(spec, tmp_path, workshop(hash_data=hash_data), {"mip": scenes})
+    for job, (kind, folder, reading, config) in zip(made.jobs, asked, strict=True):
+        content = made.tasks[job.run_dir].content
+        assert (kind, folder, config.steps) == ("train", (scenes / "kitchen").resolve(), 3)
+        assert reading == {"views": job.views, "downscale": 2, "data_format": "llff", "frame": 3}
+        assert reading.items() <= content.items()
+
+
+def test_a_scene_that_cannot_be_read_fails_in_its_run_and_one_read_wrongly_before(tmp_path, scenes):
+    def broken(kind, folder, reading, config):
+        if folder.name == "kitchen":
+            raise SceneError("the kitchen is closed", where=folder)
+        return "open"
+
+    made = plan(_real(), tmp_path, workshop(hash_data=broken), {"mip": scenes})
+    assert {o.status for o in made.jobs.values()} == {"waiting"}
+    mended = plan(_real(), tmp_path, workshop(hash_data=lambda *given: "open"), {"mip": scenes})
+    pairs = list(zip(made.jobs, mended.jobs, strict=True))
+    assert all((a.run_dir == b.run_dir) == (a.scene == "bonsai") for a, b in pairs)
+
+    def misread(*given):
+        raise ConfigError("no such view", where="--train-list 99", todo="look")
+
+    with pytest.raises(ConfigError, match=r"column 'real' of small\.yaml \(--train-list 99\)"):
+        plan(_real(), tmp_path, workshop(hash_data=misread), {"mip": scenes})
 
 
 def test_rows_that_come_to_the_same_settings_share_a_run(tmp_path):
@@ -121,9 +139,3 @@ def test_methods_and_roots_that_are_not_here_leave_their_cells(tmp_path, scenes,
         plan(spec, tmp_path, workshop(), {"mip-nerf": tmp_path / "nowhere"})
     with pytest.raises(ConfigError, match="scenes there: bonsai, kitchen"):
         plan(_real(scenes=["garden"]), tmp_path, workshop(), {"mip": scenes})
-
-
-def test_options_on_reading_are_those_of_visdom_train(tmp_path):
-    spec = table(columns=[{"label": "c", "reading": {"mask_sorce": "alpha"}}])
-    with pytest.raises(ConfigError, match="column 'c'"):
-        make(tmp_path, spec, reading=Common())

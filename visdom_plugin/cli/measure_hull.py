@@ -71,6 +71,21 @@ def _measure(argv: Sequence[str]) -> None:
             sys.stdout.write(f"{name:24s} {'-' if value is None else format(value, '.6g')}\n")
 
 
+def find_target(root: Path | None, given: str | None, frame: int | None) -> Path | None:
+    """The mesh file of the true surface: the one given, else the scene's own; None where there is none.
+
+    Args:
+        root: the scene's folder; None for the built-in scene, which knows its surface.
+        given: a mesh file that the user names.
+        frame: of a video layout.
+    """
+    from datamodules.target_mesh import find_mesh
+
+    if given is not None:
+        return Path(given).expanduser()
+    return None if root is None else find_mesh(root, frame)
+
+
 def with_target(scene, root: Path | None, given: str | None):
     """The scene with the mesh of its true surface, where there is one.
 
@@ -81,11 +96,9 @@ def with_target(scene, root: Path | None, given: str | None):
     import hashlib
 
     from datamodules.paths import read_plain
-    from datamodules.target_mesh import find_mesh, load_mesh
+    from datamodules.target_mesh import load_mesh
 
-    path = Path(given).expanduser() if given is not None else None
-    if path is None and root is not None and scene.mesh is None:
-        path = find_mesh(root, scene.source.get("frame_number"))
+    path = find_target(root, given, scene.source.get("frame_number"))
     if path is None:
         return scene
     mesh = load_mesh(path, scene.source.get("aabb"))

@@ -158,11 +158,14 @@ def parse(
 
 def read_options(options: Any) -> dict[str, Any]:
     """How a command's options say that the scene is read; index files by their full path."""
-    found = {name: getattr(options, name) for name in READING}
-    for name in ("train_list", "test_list"):
-        if found[name] is not None and Path(found[name]).is_file():
-            found[name] = str(Path(found[name]).resolve())
-    return found
+    return resolve_lists({name: getattr(options, name) for name in READING})
+
+
+def resolve_lists(reading: dict[str, Any]) -> dict[str, Any]:
+    """Options on reading with index files by their full path; lists of views stay as they are."""
+    lists = [name for name in ("train_list", "test_list") if reading.get(name) is not None]
+    files = {name: Path(reading[name]) for name in lists if Path(reading[name]).is_file()}
+    return reading | {name: str(path.resolve()) for name, path in files.items()}
 
 
 def describe_reading(common: Common) -> dict[str, Any]:

@@ -23,7 +23,6 @@ def open_scene(
     downscale: float,
     seed: int,
     missing_masks: str = "error",
-    mask_source: str = "auto",
     fill: bool = True,
     **reading: Any,
 ) -> Scene:
@@ -31,7 +30,6 @@ def open_scene(
 
     Args:
         missing_masks: what becomes of views without a mask, see `training.missing_masks`.
-        mask_source: "folder", "alpha" or "auto".
         fill: False leaves views without a mask as they are, for who only carves.
         reading: other options of `datamodules.load`.
 
@@ -41,12 +39,19 @@ def open_scene(
     from datamodules import load
     from visdom_plugin.training.missing_masks import fill_masks
 
-    if mask_source != "auto":
-        reading["mask_source"] = mask_source
-    if missing_masks != "error":
-        reading["allow_missing_masks"] = True
-    scene = load(path, views=views, downscale=downscale, seed=seed, **reading)
+    scene = load(
+        path,
+        views=views,
+        downscale=downscale,
+        seed=seed,
+        **load_options(missing_masks=missing_masks, **reading),
+    )
     return fill_masks(scene, missing_masks) if fill else scene
+
+
+def load_options(*, missing_masks: str = "error", **reading: Any) -> dict[str, Any]:
+    """Options of a command on how a scene is read, as `datamodules.load` takes them."""
+    return reading if missing_masks == "error" else reading | {"allow_missing_masks": True}
 
 
 def load_again(record: dict[str, Any], run: Path, data: Path | None) -> Scene:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import sys
 from collections.abc import Sequence
@@ -167,14 +166,14 @@ def change_spec(spec: TableSpec, options: Options) -> TableSpec:
 
 def make_workshop(options: Options) -> Any:
     """What the tables room needs of registry and data modules."""
-    from visdom_plugin.cli.options import Common
+    from visdom_plugin.cli.table_data import DataHasher, tidy_reading
     from visdom_plugin.tables.jobs import Workshop
 
     return Workshop(
         resolve=lambda kind, method, budget: _resolve(kind, method, budget, options),
         modules=MODULES,
-        built_in_hash=hash_built_in,
-        reading=Common(),
+        hash_data=DataHasher(),
+        tidy_reading=tidy_reading,
         device=options.device,
     )
 
@@ -204,16 +203,6 @@ def _resolve(kind: str, method: str, budget: str, options: Options) -> Any:
         log.warning("not available: %s", error.what)
         return None
     return Resolved(preset.name, budget, getattr(preset, budget))
-
-
-def hash_built_in() -> str:
-    """A hash of the code that draws the built-in scene."""
-    import datamodules
-
-    digest = hashlib.sha256()
-    for path in sorted(Path(datamodules.__file__).parent.glob("synthetic*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def write_table(results: Any, folder: Path) -> list[Path]:

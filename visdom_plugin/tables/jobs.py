@@ -1,7 +1,7 @@
 """From a table to its jobs: every setting resolved and every scene found before anything runs.
 
-A job's run directory is named after a hash of its resolved settings, seed and data, so that the same run is found
-again by any table, and a changed setting or photograph makes another run.
+A job's run directory is named after a hash of its resolved settings, seed and the files it reads, so that the same
+run is found again by any table, and a changed setting or photograph makes another run.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.tables.protocol import Fact, facts_of_settings, refuse_mixture
 from visdom_plugin.tables.results import Job, Outcome
 from visdom_plugin.tables.spec import BUILT_IN, Column, Row, TableSpec, nest
@@ -25,9 +25,6 @@ from visdom_plugin.training.files import write_bytes
 from visdom_plugin.training.settings import as_plain, from_plain
 
 log = logging.getLogger(__name__)
-
-WHOLE, PIECE = 1 << 20, 1 << 16
-"""Bytes: files up to WHOLE are hashed whole, longer ones by their size, first and last PIECE."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +47,11 @@ class Workshop:
     """(kind, method, budget) to the method's settings; None where no such method is installed."""
     modules: Mapping[str, str]
     """Kind to the module whose `main(argv) -> exit status` does such a job."""
-    built_in_hash: Callable[[], str]
-    """A hash of what the built-in scene is made of."""
-    reading: Any = None
-    """Dataclass of the options on how scenes are read, to check a column's `reading` against."""
+    hash_data: Callable[[str, Path | None, Mapping[str, Any], Any], str]
+    """(kind, scene's folder or None for the built-in scene, how it is read, the row's settings) to a hash of all
+    data that such a job reads."""
+    tidy_reading: Callable[[Mapping[str, Any], str], dict[str, Any]] = lambda reading, where: dict(reading)
+    """(a column's `reading`, where it stands) to the same, checked, with full paths."""
     device: str = "auto"
 
 
@@ -119,18 +117,15 @@ def plan(spec: TableSpec, runs: Path, workshop: Workshop, roots: Mapping[str, Pa
             root that is no folder, a scene that is not in it, and a mixture of protocols.
     """
     resolved = [_resolve(spec, row, workshop) for row in spec.rows]
-    for column in spec.columns:
-        if workshop.reading is not None:
-            from_plain(workshop.reading, column.reading, f"column {column.label!r} of {spec.source}")
+    readings = [workshop.tidy_reading(column.reading, _place(spec, column)) for column in spec.columns]
     refuse_mixture(_facts(spec, resolved), spec.varies, spec.source)
     folders = [_find_scenes(spec, column, dict(roots or {})) for column in spec.columns]
     found = {path for scenes in folders if scenes for path in scenes.values() if path is not None}
     if found:
         log.info("looking at the files of %d scenes", len(found))
-    hashes: dict[Path | None, str] = {}
     jobs: dict[Job, Outcome] = {}
     tasks: dict[Path, Task] = {}
-    for i, row in enumerate(spec.rows):
+    for i in range(len(spec.rows)):
         for j, column in enumerate(spec.columns):
             for scene in column.scenes:
                 for views in column.views:
@@ -141,42 +136,13 @@ def plan(spec: TableSpec, runs: Path, workshop: Workshop, roots: Mapping[str, Pa
                         elif folders[j] is None:
                             jobs[job] = Outcome("no data")
                         else:
+                            reading = {"views": views, "downscale": column.downscale}
+                            reading |= {"data_format": column.data_format, **readings[j]}
                             path = folders[j][scene]
-                            if path not in hashes:
-                                hashes[path] = workshop.built_in_hash() if path is None else hash_folder(path)
-                            task = _make_task(
-                                spec, row, column, job, resolved[i], path, hashes[path], runs, workshop
-                            )
+                            task = _make_task(spec, job, resolved[i], path, reading, runs, workshop)
                             task = tasks.setdefault(task.run_dir, task)
                             jobs[replace(job, run_dir=task.run_dir, argv=task.argv)] = Outcome("waiting")
     return Plan(spec, jobs, tasks)
-
-
-def hash_folder(folder: Path) -> str:
-    """A hash of a scene's files: names, sizes and contents; of files over a megabyte, both ends.
-
-    Hidden files and folders are left out. Photographs are compressed: a changed one changes its size or its ends.
-    """
-    digest = hashlib.sha256()
-    for base, names, files in os.walk(folder):
-        names[:] = sorted(n for n in names if not n.startswith("."))
-        for name in sorted(f for f in files if not f.startswith(".")):
-            path = Path(base) / name
-            try:
-                with path.open("rb") as file:
-                    size = os.fstat(file.fileno()).st_size
-                    digest.update(f"{path.relative_to(folder).as_posix()}\0{size}\0".encode())
-                    if size <= WHOLE:
-                        digest.update(file.read())
-                    else:
-                        digest.update(file.read(PIECE))
-                        file.seek(-PIECE, os.SEEK_END)
-                        digest.update(file.read())
-            except OSError as error:
-                raise ConfigError(
-                    f"a file of the scene cannot be read: {error.strerror}", where=path
-                ) from error
-    return digest.hexdigest()
 
 
 def _resolve(spec: TableSpec, row: Row, workshop: Workshop) -> Resolved | None:
@@ -191,9 +157,16 @@ def _resolve(spec: TableSpec, row: Row, workshop: Workshop) -> Resolved | None:
         if error.where == where:
             raise
         # Raised by a config class, which knows its own name only.
-        raise ConfigError(
-            error.what, where=f"{where} ({error.where})", cause=error.cause, todo=error.todo
-        ) from error
+        raise _within(where, error) from error
+
+
+def _within(where: str, error: ConfigError) -> ConfigError:
+    inner = "" if error.where is None else f" ({error.where})"
+    return ConfigError(error.what, where=where + inner, cause=error.cause, todo=error.todo)
+
+
+def _place(spec: TableSpec, column: Column) -> str:
+    return f"column {column.label!r} of {spec.source}"
 
 
 def _facts(spec: TableSpec, resolved: list[Resolved | None]) -> list[Fact]:
@@ -220,7 +193,7 @@ def _find_scenes(spec: TableSpec, column: Column, roots: dict[str, Path]) -> dic
             variable_of(column.root),
         )
         return None
-    where = f"column {column.label!r} of {spec.source}"
+    where = _place(spec, column)
     if not root.is_dir():
         raise ConfigError(
             f"the data root {column.root!r} is no folder: {root}",
@@ -241,21 +214,34 @@ def _find_scenes(spec: TableSpec, column: Column, roots: dict[str, Path]) -> dic
     return found
 
 
-def _make_task(
+def _hash_data(
     spec: TableSpec,
-    row: Row,
-    column: Column,
     job: Job,
     found: Resolved,
     folder: Path | None,
-    data_hash: str,
+    reading: dict[str, Any],
+    workshop: Workshop,
+) -> str:
+    try:
+        return workshop.hash_data(spec.kind, folder, reading, found.config)
+    except SceneError as error:
+        # Its run fails with the same words and does not stop the others; once mended it is another run.
+        return f"cannot be read: {error}"
+    except ConfigError as error:
+        raise _within(_place(spec, spec.columns[job.column]), error) from error
+
+
+def _make_task(
+    spec: TableSpec,
+    job: Job,
+    found: Resolved,
+    folder: Path | None,
+    reading: dict[str, Any],
     runs: Path,
     workshop: Workshop,
 ) -> Task:
     settings = as_plain(found.config)
     scene = folder.name if folder is not None else job.scene
-    reading = {"views": job.views, "downscale": column.downscale, "data_format": column.data_format}
-    reading |= column.reading
     identity = {
         "kind": spec.kind,
         "method": found.name,
@@ -264,7 +250,7 @@ def _make_task(
         "seed": job.seed,
         "scene": scene,
         "reading": reading,
-        "data": data_hash,
+        "data": _hash_data(spec, job, found, folder, reading, workshop),
     }
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
     name = f"{found.name}-{scene}-{job.views}-s{job.seed}"
@@ -280,5 +266,5 @@ def _make_task(
     }
     argv = ("--config", str(beside(run_dir, ".yaml")), "--out", str(run_dir), "--quiet")
     steps = settings.get("steps", 0) if isinstance(settings, dict) else 0
-    label = f"{row.label}, {scene}, {job.views} views, seed {job.seed}"
+    label = f"{spec.rows[job.row].label}, {scene}, {job.views} views, seed {job.seed}"
     return Task(run_dir, workshop.modules[spec.kind], argv, content, int(steps or 0), label, found.name)
