@@ -169,7 +169,7 @@ def test_hostile_words_arrive_as_they_were():
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
 def test_latex_compiles_it(tmp_path):
-    rows = [HOSTILE, "−0.5 or -0.5, not a-0", "third"]
+    rows = [HOSTILE, "\N{MINUS SIGN}0.5 or -0.5, not a-0", "third"]
     spec = replace(make_spec(rows=rows, columns=3), title=HOSTILE, notes=(HOSTILE,))
     table = to_latex(*both(make_results(spec, statuses=STATUSES)))
     assert "$-$0.5 or $-$0.5, not a-0" in table

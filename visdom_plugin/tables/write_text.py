@@ -30,6 +30,7 @@ SCENE_FIELDS = (
     "row", "method", "column", "scene", "views", "seed", "metric", "value", "status", "error", "run",
 )  # fmt: skip
 
+MINUS = "\N{MINUS SIGN}"
 _TEX = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -37,7 +38,7 @@ _TEX = {
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
     "±": r"$\pm$",
-    "−": "$-$",
+    MINUS: "$-$",
     "↑": r"$\uparrow$",
     "↓": r"$\downarrow$",
 } | {c: f"\\{c}" for c in "_&%#$"}
@@ -166,7 +167,7 @@ def _md(text: str) -> str:
 
 def _tex(text: str) -> str:
     """Escaped, with a minus, not a hyphen, before numbers."""
-    return "".join(_TEX.get(c, c) for c in re.sub(r"(?<!\w)-(?=\d)", "−", " ".join(text.split())))
+    return "".join(_TEX.get(c, c) for c in re.sub(r"(?<!\w)-(?=\d)", MINUS, " ".join(text.split())))
 
 
 def _pipe(words: Sequence[str]) -> str:
