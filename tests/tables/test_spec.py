@@ -5,7 +5,7 @@ import yaml
 
 from tests.tables.matrix import table
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables.spec import Column, _flatten, load_table, nest, parse_table
+from visdom_plugin.tables.spec import Column, flatten, load_table, nest, parse_table
 
 CONTENT = {
     "title": "Small",
@@ -100,4 +100,4 @@ def test_a_setting_and_what_is_inside_it_do_not_go_together(paths):
 
 def test_nested_settings_are_flat_again():
     flat = {"steps": 3, "hull.k": 2, "hull.bounds.lower": [0, 0, 0], "vd.missing": None}
-    assert _flatten(nest(flat, "row 'a'")) == flat
+    assert flatten(nest(flat, "row 'a'")) == flat

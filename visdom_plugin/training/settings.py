@@ -104,6 +104,8 @@ def _coerce(value: Any, hint: Any) -> tuple[bool, Any]:
             return False, None
         parts = [_coerce(v, arm) for v, arm in zip(value, arms, strict=True)]
         return all(ok for ok, _ in parts), tuple(v for _, v in parts)
+    if origin is dict:
+        return isinstance(value, dict), value
     if hint is float:
         # YAML 1.1 reads 1e-3 as text.
         if isinstance(value, str) and "e" in value.lower():
