@@ -170,7 +170,7 @@ def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
     from visdom_plugin.tables.write import write_all
     from visdom_plugin.training.rundir import read_record
 
-    column = spec.columns[0]
+    column, only = spec.columns[0], find_rows(spec, options.only)
     alone = options.executor in (None, "process") and options.workers is None and not options.dry_run
     if len(column.views) > 1 or len(spec.seeds) > 1 or not alone:
         raise ConfigError(
@@ -192,7 +192,6 @@ def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
         folds.check_views(scene, request.config)
     names = tuple(scene.train.names[i] for i in folds.held_out_views(scene))
     spec = replace(spec, columns=(replace(column, scenes=names, label=f"{scene.name}, each view held out"),))
-    only = find_rows(spec, options.only)
     outcomes: dict[Job, Outcome] = {}
     for i, (row, request) in enumerate(zip(spec.rows, requests, strict=True)):
         folder = options.runs / _name_of(row, request)

@@ -199,7 +199,7 @@ def show_summary(summary: dict[str, Any], folder: Path) -> None:
     from rich.table import Table
 
     console = Console(soft_wrap=True)
-    shown = [column for column in COLUMNS if summary["mean"].get(column[0]) is not None]
+    shown = [column for column in COLUMNS if summary["mean"].get(column[0]) is not None] or COLUMNS[:1]
     count = (
         f"{len(summary['per_view'])} of {len(summary['views'])} views" if summary["failed"] else "each view"
     )

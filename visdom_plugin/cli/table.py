@@ -236,6 +236,26 @@ def make_workshop(options: Options) -> Any:
     )
 
 
+def _refuse_misspelt(method: str, known: Sequence[str]) -> None:
+    """Tells a misspelt method from one that is not installed, whose rows stay empty.
+
+    Raises:
+        ConfigError: for a name that is nearly a known one, or an unknown variant of a known one.
+    """
+    from method_configs.not_built import NOT_BUILT
+
+    if method in NOT_BUILT:
+        return
+    by_lower = {name.lower(): name for name in (*known, *NOT_BUILT)}
+    base = method.lower().partition("+")[0]
+    near = difflib.get_close_matches(method.lower(), by_lower, 1, MISSPELT) or [base]
+    if near[0] in by_lower:
+        raise ConfigError(
+            f"there is no method {method!r}; did you mean {by_lower[near[0]]!r}?",
+            todo="correct the name, or install the package that offers it; `visdom-methods` lists what there is",
+        )
+
+
 def _resolve(kind: str, method: str, budget: str, options: Options) -> Any:
     from visdom_plugin import registry
     from visdom_plugin.cli.options import choose_budget
@@ -263,26 +283,6 @@ def _resolve(kind: str, method: str, budget: str, options: Options) -> Any:
         log.warning("not available: %s", error.what)
         return None
     return Resolved(preset.name, budget, getattr(preset, budget))
-
-
-def _refuse_misspelt(method: str, known: Sequence[str]) -> None:
-    """Tells a misspelt method from one that is not installed, whose rows stay empty.
-
-    Raises:
-        ConfigError: for a name that is nearly a known one, or an unknown variant of a known one.
-    """
-    from method_configs.not_built import NOT_BUILT
-
-    if method in NOT_BUILT:
-        return
-    by_lower = {name.lower(): name for name in (*known, *NOT_BUILT)}
-    base = method.lower().partition("+")[0]
-    near = difflib.get_close_matches(method.lower(), by_lower, 1, MISSPELT) or [base]
-    if near[0] in by_lower:
-        raise ConfigError(
-            f"there is no method {method!r}; did you mean {by_lower[near[0]]!r}?",
-            todo="correct the name, or install the package that offers it; `visdom-methods` lists what there is",
-        )
 
 
 def hash_built_in() -> str:

@@ -128,4 +128,6 @@ def _coerce(value: Any, hint: Any) -> tuple[bool, Any]:
 def _spell(hint: Any) -> str:
     if get_origin(hint) is Literal:
         return "one of " + ", ".join(repr(a) for a in get_args(hint))
+    if dict in map(get_origin, (hint, *get_args(hint))):
+        return "a mapping"
     return "a value of type " + (hint.__name__ if isinstance(hint, type) else str(hint))
