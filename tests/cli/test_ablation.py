@@ -14,7 +14,7 @@ from tests.datamodules.prepared_writer import write_prepared
 from tests.training import fake
 from visdom_plugin import registry
 from visdom_plugin.cli import table
-from visdom_plugin.cli.ablation import VARIANTS, AblationOptions, make_spec
+from visdom_plugin.cli.ablation import NAMED, VARIANTS, AblationOptions, make_spec
 from visdom_plugin.cli.ablation_figure import draw_figure
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
@@ -73,6 +73,17 @@ def test_variants_differ_in_what_they_name_and_in_nothing_else(method):
         assert not content[label]["settings"]["vd"]["enabled"]
     assert content["vanilla"]["settings"]["mask_weight"] < content["+mask"]["settings"]["mask_weight"]
     assert len({s["settings"]["steps"] for s in content.values()}) == 1
+    # What --set cannot give is what the labels speak of: the kind of hull, the hook and the mask loss.
+    for name in NAMED:
+        assert len({value for c in content.values() for value in _values(c["settings"], name)}) > 1, name
+    hooks = [c["settings"]["vd"] for c in content.values()]
+    assert {line.partition(":")[0] for h in hooks for line in differences(h, hooks[-1])} == {"enabled"}
+
+
+def _values(settings, path):
+    for name in path.split("."):
+        settings = None if settings is None else settings[name]
+    return [] if settings is None else [settings]
 
 
 def test_settings_given_once_hold_for_all_variants():
@@ -84,6 +95,61 @@ def test_settings_given_once_hold_for_all_variants():
         with pytest.raises(ConfigError, match="PATH=VALUE"):
             make_spec("ingp", AblationOptions(set=(wrong,)))
     assert spec.name == "ablation-ingp"
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "hull.kind=visdom",
+        "vd.enabled=false",
+        "mask_weight=0.2",
+        "hull=null",
+        "hull={k: 2, kind: traditional}",
+    ],
+)
+def test_what_a_variants_label_says_cannot_be_set(word):
+    with pytest.raises(ConfigError, match="the variants differ in") as caught:
+        make_spec("ingp", AblationOptions(set=("steps=9", word)))
+    assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["k_ablation", "method:fake", "--views", "4"], "not with 'k_ablation'"),
+        (["ablation:smoke", "method:fake"], "not with 'ablation:smoke'"),
+        (["--quiet", "t.yaml", "method:fake"], "not with 't.yaml'"),
+        (["ablation", "--edition", "smoke"], "no editions"),
+        (["ablation", "method:fake", "--only", "vd"], "rows: vanilla, +mask"),
+        (["ablation", "method:fake", "--only", "vd", "--leave-one-out"], "rows: vanilla, +mask"),
+        (["ablation", "method:fake", "--downscale", "0"], "1 or more"),
+        (["ablation", "method:fake", "--views", "0"], "1 or more"),
+        (["ablation", "method:fake", "--runs", "t.yaml", "--leave-one-out"], "t.yaml"),
+    ],
+)
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
+def test_other_tables_editions_rows_and_scales_are_refused(variants, words, said, dry, capsys):
+    Path("t.yaml").write_text("a file")
+    assert table.main([*words, *(dry if "--leave-one-out" not in words else [])]) == 2
+    assert said in capsys.readouterr().err
+    assert [p.name for p in Path().iterdir()] == ["t.yaml"]
+
+
+def test_the_figure_is_of_the_runs_that_were_made(variants, monkeypatch):
+    """Another look at the scene could name other runs, where something has changed in its folder meanwhile."""
+    from visdom_plugin.tables import jobs
+
+    def plan_once(*given, **named):
+        monkeypatch.setattr(jobs, "plan", None)
+        return plan(*given, **named)
+
+    monkeypatch.setattr(jobs, "plan", plan_once)
+    assert table.main([*WORDS, "--views", "4", "--downscale", "2", "--quiet", "--only", "vanilla"]) == 0
+    figure = cv2.imread("t/ablation.png")
+    height = (figure.shape[0] - 24) // 6
+    left = figure[24 + height + 40 : 24 + 2 * height - 40, 200:380].reshape(-1, 3)
+    assert (left == 200).all(1).mean() < 0.5
+    assert {keywords["downscale"] for _, keywords in variants} == {2.0}
 
 
 def test_a_method_without_variants_is_refused_with_those_that_have_them(variants, capsys):

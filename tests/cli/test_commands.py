@@ -239,13 +239,16 @@ def test_help_lists_the_built_in_methods_and_imports_nothing_heavy():
         assert name in done.stdout, name
 
 
-def test_a_full_disk_is_not_called_a_bug(capsys):
+@pytest.mark.parametrize("fault", ["ENOSPC", "EROFS", "EEXIST", "ENOTDIR", "EISDIR", "ENAMETOOLONG"])
+def test_a_full_disk_or_a_wrong_path_is_not_called_a_bug(capsys, fault):
     import errno
     import os
 
-    def full(argv):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/log.jsonl")
+    code = getattr(errno, fault)
 
-    assert errors.run(full, []) == 2
+    def fail(argv):
+        raise OSError(code, os.strerror(code), "run/log.jsonl")
+
+    assert errors.run(fail, []) == 2
     err = capsys.readouterr().err
-    assert "No space left" in err and "run/log.jsonl" in err and "bug" not in err
+    assert os.strerror(code) in err and "run/log.jsonl" in err and "bug" not in err

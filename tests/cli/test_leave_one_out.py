@@ -17,11 +17,12 @@ from tests.training import fake
 from visdom_plugin.cli import evaluate
 from visdom_plugin.cli.leave_one_out import check_views, run_folds, summarise
 from visdom_plugin.cli.options import Common
-from visdom_plugin.errors import ConfigError, EmptyHullError, SceneError
+from visdom_plugin.errors import CheckpointError, ConfigError, EmptyHullError, PluginError, SceneError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.scene import hold_out
 from visdom_plugin.training import checkpoints
 from visdom_plugin.training.missing_masks import fill_masks
+from visdom_plugin.training.trainer import TrainingError
 
 WORDS = ["--leave-one-out", "method:fake", "--method.steps", "12", "--out", "loo"]
 DOMAIN = VisibleDomain(resolution=24, k=2)
@@ -180,22 +181,53 @@ def test_without_a_method_the_default_one_is_taken(fakes, monkeypatch, capsys):
     assert "method: fake" in capsys.readouterr().out
 
 
-def test_a_view_without_which_no_hull_is_left_fails_alone(fold, monkeypatch):
+def _fail_without(view, error, monkeypatch):
     from visdom_plugin.training import run
 
     train = run.train
 
     def fail(name, config, scene, **keywords):
-        if scene.source["held_out"] == "train_2.png":
-            raise EmptyHullError("the hull is empty")
+        if scene.source["held_out"] == view:
+            raise error("it went wrong")
         return train(name, config, scene, **keywords)
 
     monkeypatch.setattr(run, "train", fail)
+
+
+@pytest.mark.parametrize("error", [EmptyHullError, SceneError, TrainingError])
+def test_a_view_without_which_nothing_can_be_made_fails_alone(fold, monkeypatch, error):
+    _fail_without("train_2.png", error, monkeypatch)
     summary = fold(fake.tiny_scene(), "some", config=fake.FakeConfig(steps=3))
-    assert summary["failed"] == {"train_2.png": "the hull is empty"}
+    assert summary["failed"] == {"train_2.png": "it went wrong"}
     assert list(summary["per_view"]) == ["train_0.png", "train_1.png", "train_3.png"]
     values = [row["psnr"] for row in summary["per_view"].values()]
     assert summary["mean"]["psnr"] == pytest.approx(sum(values) / 3)
+    assert json.loads(Path("some/leave_one_out.json").read_text()) == summary
+
+
+@pytest.mark.parametrize("error", [CheckpointError, ConfigError, PluginError])
+def test_what_is_wrong_with_every_view_stops_at_once(fold, monkeypatch, error):
+    _fail_without("train_0.png", error, monkeypatch)
+    with pytest.raises(error):
+        fold(fake.tiny_scene(), "some", config=fake.FakeConfig(steps=3))
+    assert not list(Path("some").glob("*"))
+
+
+def test_missing_masks_stop_at_once(fold):
+    scene = fake.tiny_scene()
+    gap = replace(scene.train, mask_origins=("given", "given", "given", "missing"))
+    with pytest.raises(SceneError, match=r"train_3\.png"):
+        fold(replace(scene, train=gap), "some")
+    assert not Path("some").exists()
+
+
+def test_training_that_diverges_is_told_of_every_view(fakes, capsys):
+    assert evaluate.main([*WORDS, "--method.nan-at", "3"]) == 1
+    summary = json.loads(Path("loo/leave_one_out.json").read_text())
+    assert list(summary["failed"]) == summary["views"] == [f"train_{i}.png" for i in range(4)]
+    assert all("no longer a finite number at step" in said for said in summary["failed"].values())
+    out, err = capsys.readouterr()
+    assert "4 of 4: without train_3.png" in err and out.count(" failed ") == 4
 
 
 def test_too_few_views_and_too_large_a_k_are_said_before_anything_runs(caplog):

@@ -5,7 +5,7 @@ import yaml
 
 from tests.tables.matrix import table
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables.spec import Column, _flatten, load_table, nest, parse_table
+from visdom_plugin.tables.spec import Column, flatten, list_editions, load_table, nest, parse_table
 
 CONTENT = {
     "title": "Small",
@@ -59,6 +59,16 @@ def test_an_edition_is_the_table_with_its_entries_put_in(file):
         ({"columns": [{"label": "a", "views": ["four"]}]}, "views"),
         ({"columns": [{"label": "a", "views": [0]}]}, "1 or more"),
         ({"columns": [{"label": "a", "downscale": 0.5}]}, "1 or more"),
+        ({"columns": [{"label": "a", "downscale": float("inf")}]}, "1 or more"),
+        ({"columns": [{"label": "a", "views": [4, 4, 6]}]}, "views of column 'a'"),
+        ({"columns": [{"label": "a", "root": "r", "scenes": ["b", "./b"]}]}, "scenes of column 'a'"),
+        ({"columns": [{"label": "a", "root": "r", "scenes": []}]}, "scenes of column 'a'"),
+        ({"columns": [{"label": "a", "paper": "Omni3D"}]}, "columns[0].paper cannot be 'Omni3D'"),
+        ({"rows": [{"label": "a", "method": "b", "paper": "INGP"}]}, "give a mapping"),
+        ({"layout": True}, "layout cannot be True"),
+        ({"name": "../../elsewhere"}, "cannot be called '../../elsewhere'"),
+        ({"name": ".."}, "cannot be called"),
+        ({"name": ""}, "cannot be called"),
         ({"columns": [{"label": "a", "scenes": ["kitchen"]}]}, "root"),
         ({"columns": []}, "no columns"),
         ({"rows": [{"label": "a"}]}, "no method"),
@@ -79,6 +89,34 @@ def test_what_is_wrong_in_a_table_is_named(change, said):
     assert said in str(caught.value)
 
 
+def test_editions_and_the_rows_that_they_change_may_have_numbers_for_names(tmp_path):
+    file = tmp_path / "numbers.yaml"
+    file.write_text(
+        "rows: [{label: '7', method: a}]\ncolumns: [{label: c}]\neditions: {1: {rows: {7: {method: b}}}}"
+    )
+    assert list_editions(file) == ["1"] and load_table(f"{file}:1").rows[0].method == "b"
+    with pytest.raises(ConfigError, match="editions there: 1"):
+        load_table(file, "2")
+
+
+@pytest.mark.parametrize("row", ["all", {"label": ["One"], "method": "one"}, {"method": "one"}])
+def test_an_edition_that_changes_rows_names_the_row_that_is_none(tmp_path, row):
+    file = tmp_path / "bad.yaml"
+    rows = [*CONTENT["rows"], row]
+    file.write_text(yaml.safe_dump(CONTENT | {"rows": rows}))
+    with pytest.raises(ConfigError, match=r"rows\[2\]"):
+        load_table(file, "half" if row == "all" else None)
+    with pytest.raises(ConfigError, match=r"rows\["):
+        load_table(file, "half")
+
+
+def test_an_edition_keeps_its_folder_beside_the_others(file):
+    file.write_text(yaml.safe_dump(CONTENT | {"editions": {"x/../../y": {}}}))
+    with pytest.raises(ConfigError, match="without slashes"):
+        load_table(file, "x/../../y")
+    assert load_table(file).folder_name == "small"
+
+
 def test_files_and_editions_that_are_not_there_are_named(file, tmp_path):
     with pytest.raises(ConfigError, match="did you mean 'smoke'"):
         load_table(file, "smok")
@@ -86,7 +124,7 @@ def test_files_and_editions_that_are_not_there_are_named(file, tmp_path):
         load_table(tmp_path / "other.yaml")
     with pytest.raises(ConfigError, match="two editions"):
         load_table(f"{file}:smoke", "half")
-    for text in ("[1, 2]", "a: [", "\x00"):
+    for text in ("[1, 2]", "a: [", "\x00", "a: 2026-13-32"):
         file.write_text(text)
         with pytest.raises(ConfigError, match=r"small\.yaml"):
             load_table(file)
@@ -100,4 +138,4 @@ def test_a_setting_and_what_is_inside_it_do_not_go_together(paths):
 
 def test_nested_settings_are_flat_again():
     flat = {"steps": 3, "hull.k": 2, "hull.bounds.lower": [0, 0, 0], "vd.missing": None}
-    assert _flatten(nest(flat, "row 'a'")) == flat
+    assert flatten(nest(flat, "row 'a'")) == flat

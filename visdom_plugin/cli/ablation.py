@@ -10,16 +10,15 @@ import logging
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import tyro
 
 from visdom_plugin.cli.options import WORD
-from visdom_plugin.cli.table import Options
+from visdom_plugin.cli.table import Options, change_spec, find_folders, find_rows, run_spec
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.tables.results import Job, Outcome, Results
-from visdom_plugin.tables.spec import Column, Row, TableSpec, nest
+from visdom_plugin.tables.spec import Column, Row, TableSpec, flatten, nest
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +32,8 @@ VARIANTS = (
     ("+vd", "+vd", {}),
 )
 """Labels, suffixes of the method's name, settings."""
+NAMED = ("hull.kind", "vd.enabled", "mask_weight")
+"""Settings that the variants' labels speak of."""
 METRICS = ("psnr", "ssim", "silhouette_iou", "outside_hull_mass")
 VIEWS_SHOWN = 3
 
@@ -60,10 +61,19 @@ def ablation(argv: Sequence[str]) -> int:
     if len(words) > 1:
         raise ConfigError(f"one method at a time, please: {' '.join(words)}")
     options = tyro.cli(AblationOptions, args=rest, prog=f"visdom-table {NAME} [{WORD}{DEFAULT_METHOD}]")
+    if options.table not in (None, NAME):
+        raise ConfigError(
+            f"{words[0]} goes with the table {NAME!r} alone, not with {options.table!r}",
+            where="the command line",
+            todo=f"leave out {words[0]}, or make the {NAME}: visdom-table {NAME} {words[0]}",
+        )
+    if options.edition is not None:
+        raise ConfigError(f"the {NAME} has no editions", where=f"--edition {options.edition}")
     method = words[0][len(WORD) :] if words else DEFAULT_METHOD
     spec = make_spec(method, options)
-    options = replace(options, out=options.out or Path("tables") / spec.name)
-    scene = _open(options, spec.columns[0].views[0])
+    out, runs = find_folders(spec, options)
+    options = replace(options, out=out, runs=runs)
+    scene = _open(spec, options)
     if options.leave_one_out:
         return _run_folds(spec, scene, options)
     if not len(scene.test):
@@ -72,12 +82,10 @@ def ablation(argv: Sequence[str]) -> int:
             where=options.data,
             todo="pass --leave-one-out: each training view is measured by what is made without it",
         )
-    from visdom_plugin.cli.table import run_spec
-
-    status = run_spec(spec, options)
-    if not options.dry_run:
+    status, results = run_spec(spec, options)
+    if results is not None:
         for views in spec.columns[0].views:
-            _draw(_results(spec, options), views, scene.test, options)
+            _draw(results, views, scene.test, options)
     return status
 
 
@@ -85,10 +93,10 @@ def make_spec(method: str, options: AblationOptions) -> TableSpec:
     """The table of a method's five variants.
 
     Raises:
-        ConfigError: for a method without the variants +mask and +vd, and a setting that is not PATH=VALUE.
+        ConfigError: for a method without the variants +mask and +vd, a setting that is not PATH=VALUE, and one
+            that would make a variant something else than its label says.
     """
     from visdom_plugin import registry
-    from visdom_plugin.cli.table import change_spec
 
     base = registry.find(method).name
     known = registry.installed().presets
@@ -124,9 +132,17 @@ def _read_settings(words: Sequence[str]) -> dict[str, Any]:
         if not (path and equals and value):
             raise ConfigError(f"--set {word} is not PATH=VALUE", todo="e.g. --set steps=400")
         try:
-            found[path] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
+            given = flatten({path: yaml.safe_load(value)})
+        except (yaml.YAMLError, ValueError) as error:
             raise ConfigError(f"--set {word}: {value!r} is no value") from error
+        for name in NAMED:
+            if any(name == p or name.startswith(f"{p}.") for p in given):
+                raise ConfigError(
+                    f"{name} is what the variants differ in; it cannot be the same for all of them",
+                    where=f"--set {word}",
+                    todo="write a table file to compare other variants; see docs/tables.md",
+                )
+        found |= given
     return found
 
 
@@ -135,24 +151,15 @@ def _fitting(row: Row, preset: Any) -> dict[str, Any]:
     return {k: v for k, v in row.settings.items() if not (bare and k.startswith("hull."))}
 
 
-def _open(options: AblationOptions, views: int) -> Any:
+def _open(spec: TableSpec, options: AblationOptions) -> Any:
+    """The scene whose views the figure shows: at the first number of views, with the first seed."""
     from visdom_plugin.cli.scenes import open_scene
 
-    asked = {"views": views, "downscale": options.downscale or 1.0, "seed": (options.seeds or (0,))[0]}
+    column = spec.columns[0]
+    asked = {"views": column.views[0], "downscale": column.downscale, "seed": spec.seeds[0]}
     if options.leave_one_out:
         asked |= {"fill": False, "hold_out": False}
     return open_scene(options.data, **asked)
-
-
-def _results(spec: TableSpec, options: AblationOptions) -> Results:
-    """What is on disk of the table's runs."""
-    from visdom_plugin.cli.table import make_workshop
-    from visdom_plugin.tables.driver import gather, look
-    from visdom_plugin.tables.jobs import plan
-
-    roots = {} if options.data is None else {"data": options.data}
-    made = plan(spec, options.runs or options.out / "runs", make_workshop(options), roots)
-    return gather(made, look(made))
 
 
 def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
@@ -163,7 +170,7 @@ def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
     from visdom_plugin.tables.write import write_all
     from visdom_plugin.training.rundir import read_record
 
-    column = spec.columns[0]
+    column, only = spec.columns[0], find_rows(spec, options.only)
     alone = options.executor in (None, "process") and options.workers is None and not options.dry_run
     if len(column.views) > 1 or len(spec.seeds) > 1 or not alone:
         raise ConfigError(
@@ -185,12 +192,11 @@ def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
         folds.check_views(scene, request.config)
     names = tuple(scene.train.names[i] for i in folds.held_out_views(scene))
     spec = replace(spec, columns=(replace(column, scenes=names, label=f"{scene.name}, each view held out"),))
-    wanted = [i for i, row in enumerate(spec.rows) if not options.only or row.label in options.only]
     outcomes: dict[Job, Outcome] = {}
     for i, (row, request) in enumerate(zip(spec.rows, requests, strict=True)):
-        folder = (options.runs or options.out / "runs") / _name_of(row, request)
+        folder = options.runs / _name_of(row, request)
         summary: dict[str, Any] = {"runs": {}, "failed": {}}
-        if i in wanted:
+        if only is None or i in only:
             if not options.quiet:
                 say(f"{row.label}: {row.method}")
             summary = folds.run_folds(request, scene, folder, device=device)

@@ -12,8 +12,12 @@ from visdom_plugin.errors import VisDomError
 USER_ERROR, INTERRUPTED = 2, 130
 BUG = "this is a bug in visdom-plugin or in a plugin; please report it with:"
 
-_OUTSIDE = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
-"""Faults of the disk, not of the program: full, over quota, not allowed, read-only."""
+_OUTSIDE = {
+    *(errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS),
+    *(errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP),
+}
+"""Faults of the disk or of a path that was given, not of the program: full, over quota, not allowed, read-only; a
+file where a folder should be or the other way round, a path that is too long or leads in circles."""
 
 
 def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None = None) -> int:

@@ -32,7 +32,7 @@ COLUMNS = (
 )
 """Metrics of the table on the terminal, heads and decimals."""
 FAILURES = 1
-"""Exit status when nothing could be made without one of the views."""
+"""Exit status when a run failed."""
 PROG = "visdom-eval --leave-one-out"
 
 
@@ -116,11 +116,18 @@ def check_views(scene: Any, config: Any) -> None:
 def run_folds(request: options.Request, scene: Any, folder: Path, *, device: str) -> dict[str, Any]:
     """Makes, or finds, the run without each view, and writes what they come to.
 
+    A run that fails does not stop the others: what its training diverged on, or what its hull was empty of, may be
+    due to the view that it goes without.
+
     Args:
         scene: with all views, masks not filled in yet.
 
     Returns:
         leave_one_out.json's content.
+
+    Raises:
+        SceneError: views lack masks that nobody may fill in.
+        ConfigError, CheckpointError, PluginError: settings, folder or method will not do, with or without a view.
     """
     from visdom_plugin.cli.report import say
     from visdom_plugin.cli.train import train_as_asked
@@ -129,11 +136,15 @@ def run_folds(request: options.Request, scene: Any, folder: Path, *, device: str
     from visdom_plugin.training.missing_masks import fill_masks
     from visdom_plugin.training.pictures import picture_names, write_png
     from visdom_plugin.training.settings import as_plain
+    from visdom_plugin.training.trainer import TrainingError
 
     common = request.common
     held = held_out_views(scene)
     names = picture_names(scene.train.names)
     records, failed, columns = {}, {}, []
+    if common.missing_masks == "error":
+        # A view that has no mask is held out of no run.
+        fill_masks(hold_out(scene, held[0]), "error")
     for number, i in enumerate(held, start=1):
         name = scene.train.names[i]
         if not common.quiet:
@@ -141,9 +152,9 @@ def run_folds(request: options.Request, scene: Any, folder: Path, *, device: str
         try:
             fold = fill_masks(hold_out(scene, i), common.missing_masks)
             records[name] = train_as_asked(request, fold, folder / names[i], device)
-        except EmptyHullError as error:
+        except (EmptyHullError, SceneError, TrainingError) as error:
             failed[name] = str(error)
-            log.warning("without %s nothing can be made: %s", name, error)
+            log.warning("the run without %s failed: %s", name, error)
             continue
         columns.append(_column(fold, records[name], folder / names[i]))
     if columns:
@@ -188,7 +199,7 @@ def show_summary(summary: dict[str, Any], folder: Path) -> None:
     from rich.table import Table
 
     console = Console(soft_wrap=True)
-    shown = [column for column in COLUMNS if summary["mean"].get(column[0]) is not None]
+    shown = [column for column in COLUMNS if summary["mean"].get(column[0]) is not None] or COLUMNS[:1]
     count = (
         f"{len(summary['per_view'])} of {len(summary['views'])} views" if summary["failed"] else "each view"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
 import sys
 from collections.abc import Sequence
@@ -13,10 +14,20 @@ import tyro
 
 from visdom_plugin.cli.errors import run
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables.spec import Column, TableSpec, list_editions, list_tables, load_table
+from visdom_plugin.tables.results import Results
+from visdom_plugin.tables.spec import (
+    Column,
+    TableSpec,
+    check_spec,
+    list_editions,
+    list_tables,
+    load_table,
+)
 
 MODULES = {"train": "visdom_plugin.cli.train", "hull": "visdom_plugin.cli.measure_hull"}
 """What does a job of each kind of table."""
+MISSPELT = 0.75
+"""Names as alike as this (difflib's ratio) are taken for one another's misspelling."""
 log = logging.getLogger(__name__)
 
 FAILURES = 1
@@ -92,7 +103,7 @@ def _main(argv: Sequence[str]) -> int:
         sys.stdout.write(f"{'ablation':<20} One method of your choice in five variants, on your scene\n")
         return 0
     spec = change_spec(load_table(options.table, options.edition), options)
-    return run_spec(spec, options)
+    return run_spec(spec, options)[0]
 
 
 def _ablation(argv: Sequence[str]) -> int:
@@ -101,37 +112,41 @@ def _ablation(argv: Sequence[str]) -> int:
     return ablation(argv)
 
 
-def run_spec(spec: TableSpec, options: Options) -> int:
-    """Runs a table as the options say, and returns the exit status."""
+def run_spec(spec: TableSpec, options: Options) -> tuple[int, Results | None]:
+    """Runs a table as the options say.
+
+    Returns:
+        the exit status, and what there is of the runs; None in place of it when they were only listed.
+    """
     from visdom_plugin.tables.driver import gather, look, run_plan
     from visdom_plugin.tables.jobs import plan
     from visdom_plugin.tables.overview import Overview
     from visdom_plugin.tables.state import remove_old_parts
+    from visdom_plugin.tables.summary import summarise
 
-    folder = options.out or Path("tables") / "-".join(filter(None, (spec.name, spec.edition)))
-    if folder.exists() and not folder.is_dir():
-        raise ConfigError("the table's folder is a file", where=folder, todo="choose another --out")
-    labels = [row.label for row in spec.rows]
-    for label in options.only:
-        if label not in labels:
-            raise ConfigError(f"there is no row {label!r}", where="--only", todo=f"rows: {', '.join(labels)}")
-    runs = options.runs or folder / "runs"
+    only = find_rows(spec, options.only)
+    folder, runs = find_folders(spec, options)
+    # Refuses metrics, layouts and places in the paper that are not there.
+    summarise(Results(spec))
     made = plan(spec, runs, make_workshop(options), _read_roots(options))
+    overview = Overview(quiet=options.quiet)
+    executor = _make_executor(spec, options, folder, overview.tick)
     if options.dry_run:
         sys.stdout.write("\n".join(describe_plan(made)) + "\n")
-        return 0
+        return 0, None
     for place in (folder, runs):
+        _make_folder(place)
         remove_old_parts(place)
-    overview = Overview(quiet=options.quiet)
-    results = run_plan(
+    run_plan(
         made,
-        _make_executor(spec, options, folder, overview.tick),
+        executor,
         lambda results: write_table(results, folder),
         retry=options.retry,
-        only=[labels.index(label) for label in options.only] or None,
+        only=only,
         overview=overview,
     )
-    failed = sum(outcome.status == "failed" for outcome in gather(made, look(made)).outcomes.values())
+    results = gather(made, look(made))
+    failed = sum(outcome.status == "failed" for outcome in results.outcomes.values())
     if not options.quiet:
         from visdom_plugin.cli.report import say
 
@@ -144,7 +159,47 @@ def run_spec(spec: TableSpec, options: Options) -> int:
             )
         for path in sorted(folder.glob("table.*")):
             say(f"written: {path}")
-    return FAILURES if failed else 0
+    return FAILURES if failed else 0, results
+
+
+def find_rows(spec: TableSpec, labels: Sequence[str]) -> list[int] | None:
+    """Positions of the rows that --only names; None where it names none, which is all of them.
+
+    Raises:
+        ConfigError: for a row that is not there.
+    """
+    known = [row.label for row in spec.rows]
+    for label in labels:
+        if label not in known:
+            raise ConfigError(f"there is no row {label!r}", where="--only", todo=f"rows: {', '.join(known)}")
+    return [known.index(label) for label in labels] or None
+
+
+def find_folders(spec: TableSpec, options: Options) -> tuple[Path, Path]:
+    """The table's folder and that of its runs, neither of which need be there yet.
+
+    Raises:
+        ConfigError: when one of them is a file, or would lie below one.
+    """
+    folder = options.out or Path("tables") / spec.folder_name
+    runs = options.runs or folder / "runs"
+    for what, option, path in (("table", "--out", folder), ("runs", "--runs", runs)):
+        for place in (path, *path.parents):
+            if place.exists() and not place.is_dir():
+                said = "is a file" if place == path else f"cannot be made: {place} is a file"
+                raise ConfigError(
+                    f"the folder of the {what} {said}", where=path, todo=f"choose another {option}"
+                )
+    return folder, runs
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"the folder cannot be made: {error.strerror}", where=path, todo="choose another --out or --runs"
+        ) from error
 
 
 def change_spec(spec: TableSpec, options: Options) -> TableSpec:
@@ -159,9 +214,11 @@ def change_spec(spec: TableSpec, options: Options) -> TableSpec:
         columns = tuple(replace(column, views=options.views) for column in columns)
     if options.downscale is not None:
         columns = tuple(replace(column, downscale=options.downscale) for column in columns)
-    return replace(
+    changed = replace(
         spec, columns=columns, seeds=options.seeds or spec.seeds, budget=options.budget or spec.budget
     )
+    check_spec(changed, "the command line")
+    return changed
 
 
 def make_workshop(options: Options) -> Any:
@@ -176,6 +233,26 @@ def make_workshop(options: Options) -> Any:
         tidy_reading=tidy_reading,
         device=options.device,
     )
+
+
+def _refuse_misspelt(method: str, known: Sequence[str]) -> None:
+    """Tells a misspelt method from one that is not installed, whose rows stay empty.
+
+    Raises:
+        ConfigError: for a name that is nearly a known one, or an unknown variant of a known one.
+    """
+    from method_configs.not_built import NOT_BUILT
+
+    if method in NOT_BUILT:
+        return
+    by_lower = {name.lower(): name for name in (*known, *NOT_BUILT)}
+    base = method.lower().partition("+")[0]
+    near = difflib.get_close_matches(method.lower(), by_lower, 1, MISSPELT) or [base]
+    if near[0] in by_lower:
+        raise ConfigError(
+            f"there is no method {method!r}; did you mean {by_lower[near[0]]!r}?",
+            todo="correct the name, or install the package that offers it; `visdom-methods` lists what there is",
+        )
 
 
 def _resolve(kind: str, method: str, budget: str, options: Options) -> Any:
@@ -198,8 +275,10 @@ def _resolve(kind: str, method: str, budget: str, options: Options) -> Any:
     try:
         preset = registry.find(method)
     except ConfigError as error:
-        if not registry.installed().presets:
+        known = registry.installed()
+        if not known.presets:
             raise
+        _refuse_misspelt(method, [*known.presets, *known.aliases])
         log.warning("not available: %s", error.what)
         return None
     return Resolved(preset.name, budget, getattr(preset, budget))

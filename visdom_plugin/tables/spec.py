@@ -6,10 +6,12 @@ Plain data, read from YAML. Free of heavy imports.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+import math
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from importlib.resources import files
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from visdom_plugin.errors import ConfigError
@@ -98,6 +100,11 @@ class TableSpec:
     edition: str = ""
     """The edition chosen; empty for the table as it stands."""
 
+    @property
+    def folder_name(self) -> str:
+        """What its folder is called by default: name and edition."""
+        return "-".join(filter(None, (self.name, self.edition)))
+
 
 def list_tables() -> dict[str, Path]:
     """Names of the shipped tables, with their files."""
@@ -148,7 +155,7 @@ def parse_table(content: dict[str, Any], name: str, where: str, edition: str = "
             Row(label="", method=""),
             {
                 **row,
-                "settings": _flatten(shared) | _flatten(_mapping(row.get("settings", {}), "settings", where)),
+                "settings": flatten(shared) | flatten(_mapping(row.get("settings", {}), "settings", where)),
             },
             f"rows[{i}]",
             where,
@@ -171,7 +178,7 @@ def parse_table(content: dict[str, Any], name: str, where: str, edition: str = "
     made = {f.name: getattr(spec, f.name) for f in fields(spec)}
     made |= {"rows": tuple(rows), "columns": tuple(columns), "source": where, "edition": edition}
     spec = TableSpec(**made)
-    _check(spec, where)
+    check_spec(spec, where)
     return spec
 
 
@@ -202,9 +209,10 @@ def _read(path: Path) -> dict[str, Any]:
         content = yaml.load(Path(path).read_text(encoding="utf-8"), Loader=loader)
     except OSError as error:
         raise ConfigError(f"the table cannot be read: {error.strerror}", where=path) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError) as error:
+        # ValueError: no text, or a date that no calendar has.
         raise ConfigError(f"the table is not YAML: {error}", where=path) from error
-    return dict(_mapping(content, "the file", path))
+    return _mapping(content, "the file", path)
 
 
 def _merge(base: Any, change: Any, where: object) -> Any:
@@ -220,14 +228,16 @@ def _merge(base: Any, change: Any, where: object) -> Any:
 
 
 def _merge_rows(rows: list[Any], changes: dict[str, Any], where: object) -> list[Any]:
-    labels = [row.get("label") for row in rows if isinstance(row, dict)]
-    for label in changes:
+    by_label = _mapping(changes, "rows", where)
+    rows = _mappings(rows, "rows", where)
+    labels = [str(row.get("label")) for row in rows]
+    for label in by_label:
         if label not in labels:
             raise ConfigError(
-                f"an edition changes a row {label!r} that is not there{_nearest(str(label), labels)}",
+                f"an edition changes a row {label!r} that is not there{_nearest(label, labels)}",
                 where=where,
             )
-    merged = [_merge(row, changes.get(row.get("label"), {}), where) for row in rows]
+    merged = [_merge(row, by_label.get(label, {}), where) for row, label in zip(rows, labels, strict=True)]
     return [row for row in merged if row is not None]
 
 
@@ -244,12 +254,12 @@ def _tidy_column(column: dict[str, Any]) -> dict[str, Any]:
     return tidy
 
 
-def _flatten(settings: dict[str, Any], path: str = "") -> dict[str, Any]:
+def flatten(settings: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     """Nested mappings to dotted paths: {"hull": {"k": 2}} and {"hull.k": 2} say the same."""
     flat = {}
     for key, value in settings.items():
         name = f"{path}.{key}" if path else str(key)
-        flat |= _flatten(value, name) if isinstance(value, dict) else {name: value}
+        flat |= flatten(value, name) if isinstance(value, dict) else {name: value}
     return flat
 
 
@@ -297,7 +307,23 @@ def _parse(
     return from_plain(template, content, where, path)
 
 
-def _check(spec: TableSpec, where: str) -> None:
+def check_spec(spec: TableSpec, where: str) -> None:
+    """Refuses values that no table can have.
+
+    Args:
+        where: where they were given.
+
+    Raises:
+        ConfigError: naming the row or column.
+    """
+    name = spec.folder_name
+    if not re.fullmatch(r"[^/\\\0-\x1f]+", name) or name in (".", ".."):
+        raise ConfigError(
+            f"a table cannot be called {name!r}",
+            where=where,
+            cause="its folder is named after its `name:` and edition",
+            todo="use a name without slashes",
+        )
     for kind, entries in (("rows", spec.rows), ("columns", spec.columns)):
         if not entries:
             raise ConfigError(f"the table has no {kind}", where=where)
@@ -307,9 +333,8 @@ def _check(spec: TableSpec, where: str) -> None:
             raise ConfigError(
                 f"two {kind} have the label {double[0]!r}", where=where, todo="make labels unique"
             )
-    for what, values in (("seeds", spec.seeds), ("metrics", spec.metrics)):
-        if not values or len(set(values)) < len(values):
-            raise ConfigError(f"{what} must be one or more different values, not {list(values)}", where=where)
+    _demand_different("seeds", spec.seeds, where)
+    _demand_different("metrics", spec.metrics, where)
     _choose("kind", spec.kind, ("train", "hull"), where)
     for row in spec.rows:
         _choose(f"budget of row {row.label!r}", row.budget or spec.budget, ("quick", "full", "auto"), where)
@@ -317,9 +342,10 @@ def _check(spec: TableSpec, where: str) -> None:
         if not name.startswith("hull."):
             _choose("a fact in varies", name, FACTS, where)
     for column in spec.columns:
-        if not column.scenes or not column.views:
-            raise ConfigError(f"column {column.label!r} has no scenes or no views", where=where)
-        if min(column.views) < 1 or not column.downscale >= 1:
+        # A scene or a number of views that counts twice would weigh twice in means.
+        _demand_different(f"views of column {column.label!r}", column.views, where)
+        _demand_different(f"scenes of column {column.label!r}", map(PurePath, column.scenes), where)
+        if min(column.views) < 1 or not 1 <= column.downscale < math.inf:
             raise ConfigError(
                 f"column {column.label!r} has views {list(column.views)} and downscale {column.downscale:g}; "
                 "both must be 1 or more",
@@ -342,10 +368,17 @@ def _choose(what: str, value: str, valid: tuple[str, ...], where: str) -> None:
         )
 
 
+def _demand_different(what: str, values: Iterable[Any], where: str) -> None:
+    values = list(values)
+    if not values or len(set(values)) < len(values):
+        shown = ", ".join(map(str, values)) or "none"
+        raise ConfigError(f"{what} must be one or more different values, not {shown}", where=where)
+
+
 def _mapping(value: Any, what: str, where: object) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         raise ConfigError(f"{what} must be a mapping, not {type(value).__name__}", where=where)
-    return dict(value)
+    return {str(key): entry for key, entry in value.items()}
 
 
 def _mappings(value: Any, what: str, where: object) -> list[dict[str, Any]]:

@@ -104,6 +104,8 @@ def _coerce(value: Any, hint: Any) -> tuple[bool, Any]:
             return False, None
         parts = [_coerce(v, arm) for v, arm in zip(value, arms, strict=True)]
         return all(ok for ok, _ in parts), tuple(v for _, v in parts)
+    if origin is dict:
+        return isinstance(value, dict), value
     if hint is float:
         # YAML 1.1 reads 1e-3 as text.
         if isinstance(value, str) and "e" in value.lower():
@@ -126,4 +128,6 @@ def _coerce(value: Any, hint: Any) -> tuple[bool, Any]:
 def _spell(hint: Any) -> str:
     if get_origin(hint) is Literal:
         return "one of " + ", ".join(repr(a) for a in get_args(hint))
+    if dict in map(get_origin, (hint, *get_args(hint))):
+        return "a mapping"
     return "a value of type " + (hint.__name__ if isinstance(hint, type) else str(hint))
