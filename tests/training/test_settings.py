@@ -88,6 +88,7 @@ def test_fields_left_out_keep_the_templates_values():
         ("steps: 2.5", r"steps cannot be 2\.5"),
         ("steps: true", "steps cannot be True"),
         ("rate: fast", "rate cannot be 'fast'"),
+        (f"rate: 1{'0' * 400}", "rate cannot be 1000"),
         ("active: 1", "active cannot be 1"),
         ("kind: z", r"kind cannot be 'z'[\s\S]*one of 'x', 'y'"),
         ("inner: {pair: [1]}", r"inner\.pair cannot be \[1\]"),

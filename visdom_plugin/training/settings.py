@@ -108,14 +108,13 @@ def _coerce(value: Any, hint: Any) -> tuple[bool, Any]:
         return isinstance(value, dict), value
     if hint is float:
         # YAML 1.1 reads 1e-3 as text.
-        if isinstance(value, str) and "e" in value.lower():
-            try:
-                return True, float(value)
-            except ValueError:
-                return False, None
-        return isinstance(value, (int, float)) and not isinstance(value, bool), (
-            float(value) if isinstance(value, (int, float)) else None
-        )
+        exponent = isinstance(value, str) and "e" in value.lower()
+        if isinstance(value, bool) or not (exponent or isinstance(value, (int, float))):
+            return False, None
+        try:
+            return True, float(value)
+        except (ValueError, OverflowError):
+            return False, None
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool), value
     if isinstance(hint, type) and issubclass(hint, PurePath):
