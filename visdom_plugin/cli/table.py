@@ -126,7 +126,7 @@ def run_spec(spec: TableSpec, options: Options) -> int:
     overview = Overview(quiet=options.quiet)
     results = run_plan(
         made,
-        _make_executor(spec, options, folder, overview.tick),
+        _make_executor(spec, options, runs, overview.tick),
         lambda results: write_table(results, folder),
         retry=options.retry,
         only=[labels.index(label) for label in options.only] or None,
@@ -260,7 +260,7 @@ def _read_roots(options: Options) -> dict[str, Path]:
     return roots
 
 
-def _make_executor(spec: TableSpec, options: Options, folder: Path, tick: Any) -> Any:
+def _make_executor(spec: TableSpec, options: Options, runs: Path, tick: Any) -> Any:
     from visdom_plugin.tables.executors import Here, Local
     from visdom_plugin.tables.slurm import Slurm, read_config
 
@@ -272,7 +272,7 @@ def _make_executor(spec: TableSpec, options: Options, folder: Path, tick: Any) -
     resources = read_config(spec, options.slurm)
     if kind == "process":
         return Here(tick)
-    return Local(options.workers or 1) if kind == "local" else Slurm(resources, folder)
+    return Local(options.workers or 1) if kind == "local" else Slurm(resources, runs)
 
 
 if __name__ == "__main__":
