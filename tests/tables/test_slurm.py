@@ -241,6 +241,20 @@ def test_on_a_real_cluster_a_killed_driver_and_a_killed_worker_lose_nothing(clus
     assert starts == [1, 1, 1, 1, 2, 2]
 
 
+@pytest.mark.slow
+def test_on_a_real_cluster_two_drivers_started_together_run_everything_once(cluster, tmp_path):
+    spec = long_table(0.1)
+    here, there = tmp_path / "here", tmp_path / "there"
+    run_plan(make(here, table_without_deaths(spec)), Here(), write(here))
+    command = [sys.executable, "-m", "tests.tables.test_slurm", str(there)]
+    both = [subprocess.Popen(command, cwd=ROOT) for _ in range(2)]
+    assert [process.wait(300) for process in both] == [0, 0]
+    assert (there / "table.txt").read_text() == (here / "table.txt").read_text()
+    starts = [len((run_dir / "starts").read_text()) for run_dir in make(there, spec).tasks]
+    assert starts == [1, 1, 1, 1, 2, 2]
+    assert json.loads((there / "slurm.json").read_text()) == {"batches": {}}
+
+
 def table_without_deaths(spec):
     rows = tuple(replace(row, settings=row.settings | {"dies_at": -1}) for row in spec.rows)
     return replace(spec, rows=rows)
