@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import io
 import json
+import math
 import os
 import random
 import re
@@ -332,7 +333,8 @@ def _counts(said):
 
 
 @pytest.mark.parametrize("executor", [Here, lambda tick: Local(1, threads=1)])
-def test_progress_counts_the_runs_asked_for(tmp_path, executor):
+def test_progress_counts_the_runs_asked_for(tmp_path, monkeypatch, executor):
+    monkeypatch.setattr(overview, "EVERY", math.inf)
     rows = [
         {"label": "Good", "method": "one"},
         {"label": "Bad", "method": "two", "settings": {"crash": True}},
@@ -383,6 +385,21 @@ def test_the_time_left_is_shared_by_what_runs(tmp_path):
         assert (
             f"1/18 done, {running} running, about {spell_seconds(17 * 8 / running)} left\n" in said.getvalue()
         )
+
+
+def test_steps_of_an_earlier_time_say_nothing_of_the_time_left(tmp_path, monkeypatch):
+    monkeypatch.setattr(overview, "EVERY", 0.0)
+    tasks = make(tmp_path, table(settings={"steps": 100}, seeds=[0])).tasks
+    run_dir = next(iter(tasks))
+    said = io.StringIO()
+    shown, known = Overview(stream=said), dict.fromkeys(tasks, Outcome("waiting"))
+    for step in (50, 51):
+        state.write_json(run_dir / f"checkpoints/step-{step}.json", {})
+        if step == 50:
+            shown.begin(tasks, known)
+            known[run_dir] = Outcome("running")
+        shown.show(known)
+        assert ("left" in said.getvalue()) == (step > 50)
 
 
 def test_only_old_leftovers_are_removed(tmp_path):

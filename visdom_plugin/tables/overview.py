@@ -45,10 +45,10 @@ class Overview:
         """Says what there is to do of some tasks, by run directory; those that are waiting are to be run."""
         self._tasks, self._known = tasks, known
         self._begin = self._shown = time.monotonic()
-        counts = self._count()
-        self._done_before = counts["finished"] + counts["failed"]
         if self.quiet:
             return
+        counts = self._count()
+        self._before = {d: self._reached(d) for d in tasks if known[d].status == "waiting"}
         if counts["waiting"] and self.stream.isatty():
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -65,7 +65,7 @@ class Overview:
             self._line = self._bar.add_task("", total=1.0, note="")
         failed = f", {counts['failed']} failed before" if counts["failed"] else ""
         self._say(
-            f"{len(tasks)} runs in all, {counts['finished']} of them done before{failed}, "
+            f"{len(tasks)} run{'s' * (len(tasks) != 1)} in all, {counts['finished']} of them done before{failed}, "
             f"{counts['waiting']} to do"
         )
 
@@ -121,11 +121,15 @@ class Overview:
         return note, sum(shares.values()) / max(len(shares), 1)
 
     def _share(self, run_dir: Path) -> float:
-        status, steps = self._known[run_dir].status, self._tasks[run_dir].steps
+        status = self._known[run_dir].status
         if status in ("finished", "failed"):
             return 1.0
+        return self._reached(run_dir) if status == "running" else 0.0
+
+    def _reached(self, run_dir: Path) -> float:
+        steps = self._tasks[run_dir].steps
         # After the last step comes the evaluation.
-        return 0.9 * min(read_step(run_dir) / steps, 1.0) if status == "running" and steps else 0.0
+        return 0.9 * min(read_step(run_dir) / steps, 1.0) if steps else 0.0
 
     def _estimate(self, shares: Mapping[Path, float], running: int) -> float | None:
         """Seconds left: by what finished runs of the same method, or of any, took on average; before the first, by
@@ -143,7 +147,7 @@ class Overview:
         every = [s for values in took.values() for s in values]
         to_do = len(shares) - sum(shares.values())
         if not every:
-            gained = sum(shares.values()) - self._done_before
+            gained = sum(max(shares[run_dir] - share, 0.0) for run_dir, share in self._before.items())
             return (time.monotonic() - self._begin) * to_do / gained if gained > 0 else None
         left = 0.0
         for run_dir, share in shares.items():
