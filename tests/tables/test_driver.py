@@ -4,8 +4,10 @@ import contextlib
 import fcntl
 import io
 import json
+import math
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -17,10 +19,12 @@ import pytest
 
 from tests.tables.matrix import ROOT, long_table, make, table, write
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables import driver, executors
+from visdom_plugin.tables import driver, executors, overview, state
 from visdom_plugin.tables.driver import run_plan
-from visdom_plugin.tables.executors import Here, Local
-from visdom_plugin.tables.overview import Overview
+from visdom_plugin.tables.executors import Ended, Here, Local
+from visdom_plugin.tables.jobs import Task
+from visdom_plugin.tables.overview import Overview, spell_seconds
+from visdom_plugin.tables.results import Outcome
 from visdom_plugin.tables.state import is_held
 
 
@@ -91,10 +95,16 @@ def test_failed_runs_are_tried_again_only_when_asked(tmp_path, monkeypatch):
     assert _starts(made) == [2, 2] and " None None" not in _table_of(tmp_path)
 
 
-def test_only_the_rows_asked_for_are_run_and_the_others_show_what_there_is(tmp_path):
-    made = make(tmp_path)
-    assert _statuses(run_plan(made, Here(), write(tmp_path), only=[1])) == ["waiting"] * 2 + ["finished"] * 2
-    assert _starts(made) == [0, 0, 1, 1]
+@pytest.mark.parametrize("retry", [False, True])
+def test_only_the_rows_asked_for_are_run_and_the_others_show_what_there_is(tmp_path, retry):
+    rows = [{"label": "Bad", "method": "one", "settings": {"complaint": "no"}}]
+    rows += [{"label": n, "method": n} for n in ("two", "three+vd")]
+    made = make(tmp_path, table(rows))
+    before = run_plan(made, Here(), write(tmp_path), only=[0])
+    assert _statuses(before) == ["failed"] * 2 + ["waiting"] * 4
+    after = run_plan(made, Here(), write(tmp_path), only=[2], retry=retry)
+    assert [o for j, o in after.outcomes.items() if j.row < 2] == list(before.outcomes.values())[:4]
+    assert _statuses(after)[4:] == ["finished"] * 2 and _starts(made) == [1, 1, 0, 0, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -223,25 +233,173 @@ def _kill(pid):
         os.kill(pid, signal.SIGKILL)
 
 
-def test_progress_counts_all_jobs_and_quiet_is_silent(tmp_path):
+def test_two_drivers_on_one_folder_make_the_table_of_one(tmp_path, undisturbed):
+    both = [_drive(tmp_path) for _ in range(2)]
+    assert [process.wait(300) for process in both] == [0, 0]
+    assert _table_of(tmp_path) == undisturbed
+    left = {"".join(p.suffixes) for p in (tmp_path / "runs").iterdir() if p.is_file()}
+    assert left == {".yaml", ".log", ".error.json"}
+
+
+def test_every_driver_hears_its_own_process_and_leaves_no_file_of_it(tmp_path, monkeypatch):
+    (tmp_path / "speaker.py").write_text(
+        "import pathlib, sys, time\n"
+        "def main(argv):\n"
+        "    while not pathlib.Path('go').exists():\n"
+        "        time.sleep(0.01)\n"
+        "    print(argv[0], file=sys.stderr, flush=True)\n"
+        "    pathlib.Path(argv[0]).touch()\n"
+        "    return 2\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), str(ROOT)]))
+    monkeypatch.chdir(tmp_path)
+    Path("runs").mkdir()
+    drivers = {word: Local(1, threads=1) for word in ("a short word", "a longer word")}
+    for word, executor in drivers.items():
+        executor.start([Task(tmp_path / "runs" / "same", "speaker", (word,))])
+    Path("go").touch()
+    until = time.monotonic() + 60
+    while not all(Path(word).exists() for word in drivers) and time.monotonic() < until:
+        time.sleep(0.01)
+    for word, executor in drivers.items():
+        while not (ended := executor.poll()):
+            time.sleep(0.01)
+        assert [(e.code, e.said) for e in ended] == [(2, word + "\n")]
+    assert list((tmp_path / "runs").iterdir()) == []
+
+
+class Scripted:
+    """An executor whose tasks end as a test says, one per poll and the last one first; two of them run."""
+
+    pause = 0.0
+
+    def __init__(self, end):
+        self.end, self.tasks = end, []
+
+    def free(self):
+        return 9
+
+    def adopt(self, tasks):
+        return []
+
+    def start(self, tasks):
+        self.tasks += tasks
+
+    def queued(self):
+        return {task.run_dir for task in self.tasks[:-2]}
+
+    def poll(self):
+        return [self.end(self.tasks.pop())]
+
+    def stop(self):
+        pass
+
+
+def test_what_another_driver_noted_is_kept_and_a_busy_process_is_not_heard(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver, "BUSY_PAUSE", 0.0)
+    made = make(tmp_path, table(seeds=[0]))
+    one, two = made.tasks
+    log = state.beside(one, ".log")
+    seen = []
+
+    def end(task):
+        seen.append((task.run_dir, log.exists()))
+        if task.run_dir == two:
+            return Ended(task, 1, "Error: two")
+        if len(seen) < 3:
+            return Ended(task, 2, f"error: {state.BUSY}")
+        state.note_error(one, "said to the other driver")
+        return Ended(task, -signal.SIGKILL, "and not to this one")
+
+    results = run_plan(made, Scripted(end), write(tmp_path))
+    assert seen == [(two, False), (one, False), (one, False)]
+    assert [o.error for o in results.outcomes.values()] == ["said to the other driver", "Error: two"]
+    assert log.read_text() == "and not to this one"
+
+
+def _watch(made, folder, executor, **changes):
+    """Everything that the overview says of a table."""
+    said = io.StringIO()
+    run_plan(made, executor, write(folder), overview=Overview(stream=said), **changes)
+    return said.getvalue()
+
+
+def _counts(said):
+    """(done, of, running) of every line that says how far it is."""
+    return [
+        tuple(map(int, found))
+        for found in re.findall(r"^(\d+)/(\d+) done, (\d+) running", said, re.MULTILINE)
+    ]
+
+
+@pytest.mark.parametrize("executor", [Here, lambda tick: Local(1, threads=1)])
+def test_progress_counts_the_runs_asked_for(tmp_path, monkeypatch, executor):
+    monkeypatch.setattr(overview, "EVERY", math.inf)
     rows = [
         {"label": "Good", "method": "one"},
         {"label": "Bad", "method": "two", "settings": {"crash": True}},
     ]
-    for name, quiet in (("loud", False), ("quiet", True)):
+    rows.append({"label": "Later", "method": "three+vd"})
+    made, shown = make(tmp_path, table(rows)), Overview(stream=io.StringIO())
+    run_plan(made, executor(shown.tick), write(tmp_path), only=[0, 1], overview=shown)
+    said = shown.stream.getvalue()
+    assert "4 runs in all, 0 of them done before, 4 to do" in said
+    assert said.count("finished: Good") == 2 and said.count("lava") == 2
+    # After each end comes a line that knows what runs next; the last one says no time.
+    assert _counts(said) == [(1, 4, 1), (2, 4, 1), (3, 4, 1), (4, 4, 0)]
+    assert said.endswith("4/4 done, 0 running, 2 failed\n")
+    assert "4 runs in all, 2 of them done before, 2 failed before, 0 to do" in _watch(
+        made, tmp_path, Here(), only=[0, 1]
+    )
+    assert "2 runs in all, 0 of them done before, 2 to do" in _watch(made, tmp_path, Here(), only=[2])
+
+
+def test_a_quiet_overview_is_silent(tmp_path):
+    said = io.StringIO()
+    run_plan(make(tmp_path), Here(), write(tmp_path), overview=Overview(quiet=True, stream=said))
+    assert said.getvalue() == ""
+
+
+def test_what_waits_in_a_queue_is_not_running(tmp_path, monkeypatch):
+    monkeypatch.setattr(overview, "EVERY", 0.0)
+    said = _watch(
+        make(tmp_path, table(seeds=[0, 1, 2])), tmp_path, Scripted(lambda task: Ended(task, 1, "no"))
+    )
+    assert _counts(said) == [(0, 6, 2), (1, 6, 2), (2, 6, 2), (3, 6, 2), (4, 6, 2), (5, 6, 1), (6, 6, 0)]
+
+
+def test_the_time_left_is_shared_by_what_runs(tmp_path):
+    tasks = make(tmp_path, table(seeds=list(range(9)))).tasks
+    for running in (1, 2, 4):
         said = io.StringIO()
-        run_plan(
-            make(tmp_path / name, table(rows)),
-            Here(),
-            write(tmp_path),
-            overview=Overview(quiet=quiet, stream=said),
+        shown = Overview(stream=said)
+        known = dict.fromkeys(tasks, Outcome("waiting"))
+        known |= dict.fromkeys(list(tasks)[:running], Outcome("running"))
+        shown.begin(tasks, known)
+        known[list(tasks)[-1]] = Outcome(
+            "finished", {"timing": {"hull_s": 1.0, "train_s": 6.0, "eval_s": 1.0}}
         )
-        if quiet:
-            assert said.getvalue() == ""
-        else:
-            assert "4 runs in all, 0 of them done before" in said.getvalue()
-            assert "4/4 done, 0 running, 2 failed" in said.getvalue()
-            assert "lava" in said.getvalue() and "finished: Good" in said.getvalue()
+        shown.report(tasks[list(tasks)[-1]], known[list(tasks)[-1]])
+        shown.show(known)
+        # 17 of 18 are left, of 8 seconds each.
+        assert (
+            f"1/18 done, {running} running, about {spell_seconds(17 * 8 / running)} left\n" in said.getvalue()
+        )
+
+
+def test_steps_of_an_earlier_time_say_nothing_of_the_time_left(tmp_path, monkeypatch):
+    monkeypatch.setattr(overview, "EVERY", 0.0)
+    tasks = make(tmp_path, table(settings={"steps": 100}, seeds=[0])).tasks
+    run_dir = next(iter(tasks))
+    said = io.StringIO()
+    shown, known = Overview(stream=said), dict.fromkeys(tasks, Outcome("waiting"))
+    for step in (50, 51):
+        state.write_json(run_dir / f"checkpoints/step-{step}.json", {})
+        if step == 50:
+            shown.begin(tasks, known)
+            known[run_dir] = Outcome("running")
+        shown.show(known)
+        assert ("left" in said.getvalue()) == (step > 50)
 
 
 def test_only_old_leftovers_are_removed(tmp_path):

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import types
 from dataclasses import replace
@@ -16,11 +17,11 @@ import pytest
 from tests.tables import slurm_cluster
 from tests.tables.matrix import ROOT, long_table, make, table, write
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables import slurm
-from visdom_plugin.tables.driver import run_plan
+from visdom_plugin.tables import batches, slurm
+from visdom_plugin.tables.driver import Interrupted, run_plan
 from visdom_plugin.tables.executors import Here
 from visdom_plugin.tables.slurm import Slurm, SlurmConfig, SlurmError, read_config
-from visdom_plugin.tables.state import beside
+from visdom_plugin.tables.state import beside, note_error
 from visdom_plugin.training.files import write_json
 
 CONFIG = SlurmConfig(partition="tests", cpus=1, memory_gb=None, time_min=5, poll_seconds=0.5)
@@ -42,7 +43,7 @@ def test_resources_come_from_the_table_and_from_a_file_which_wins(tmp_path):
 @pytest.fixture
 def queue(monkeypatch):
     """A cluster made of a list: what was submitted as [(name, run_dirs, options)], and who is alive."""
-    made = types.SimpleNamespace(submitted=[], alive=set(), dies=False)
+    made = types.SimpleNamespace(submitted=[], alive=set(), dies=False, meanwhile=lambda: None)
 
     class AutoExecutor:
         def __init__(self, folder, cluster=None):
@@ -52,6 +53,7 @@ def queue(monkeypatch):
             self.given = given
 
         def map_array(self, function, modules, argvs, run_dirs, names, cpus):
+            made.meanwhile()
             made.submitted.append((names[0], run_dirs, self.given))
             made.alive |= {(names[0], i) for i in range(len(run_dirs))}
             if made.dies:
@@ -60,8 +62,9 @@ def queue(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "submitit", types.SimpleNamespace(AutoExecutor=AutoExecutor))
     monkeypatch.setattr(slurm.shutil, "which", lambda name: name)
-    monkeypatch.setattr(Slurm, "_alive", lambda self, names: {x for x in made.alive if x[0] in names})
-    monkeypatch.setattr(slurm.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(
+        batches, "read_queue", lambda names: {x: "RUNNING" for x in made.alive if x[0] in names}
+    )
     return made
 
 
@@ -84,6 +87,70 @@ def test_what_a_dead_driver_submitted_is_not_submitted_again(tmp_path, queue, di
     second = Slurm(CONFIG, tmp_path)
     assert second.adopt(tasks) == tasks[1:]
     assert [(e.task, e.code) for e in second.poll()] == [(tasks[3], 7)]
+
+
+def test_drivers_that_submit_at_the_same_time_note_every_batch(tmp_path, queue):
+    tasks = list(make(tmp_path, table(seeds=list(range(8)))).tasks.values())
+    starts = [threading.Thread(target=Slurm(CONFIG, tmp_path).start, args=([task],)) for task in tasks]
+    for start in starts:
+        start.start()
+    for start in starts:
+        start.join()
+    noted = json.loads((tmp_path / "slurm.json").read_text())["batches"].values()
+    assert sorted(run for batch in noted for run in batch["runs"]) == sorted(t.run_dir.name for t in tasks)
+    assert all(batch["id"] for batch in noted)
+
+
+def test_what_another_driver_is_about_to_submit_is_neither_forgotten_nor_submitted_again(tmp_path, queue):
+    tasks = list(make(tmp_path).tasks.values())
+    first, second = Slurm(CONFIG, tmp_path), Slurm(replace(CONFIG, poll_seconds=0.0), tmp_path)
+    assert first.adopt(tasks) == second.adopt(tasks) == []
+
+    def meanwhile():
+        # Between the first driver's note and its submission.
+        queue.meanwhile = lambda: None
+        assert Slurm(CONFIG, tmp_path).adopt([]) == []
+        second.start(tasks)
+        assert [second.poll() for _ in range(2 * slurm.ABSENT)] == [[]] * 2 * slurm.ABSENT
+        assert second.queued() == {task.run_dir for task in tasks}
+
+    queue.meanwhile = meanwhile
+    first.start(tasks)
+    ((name, run_dirs, _),) = queue.submitted
+    assert run_dirs == [str(task.run_dir) for task in tasks]
+    assert second.poll() == [] and not second.queued()
+    assert Slurm(CONFIG, tmp_path).adopt(tasks) == tasks
+    # Both hear the end; a task that was stopped is submitted again by one of them alone.
+    word = {"batch": name, "code": 130, "said": "stopped"}
+    write_json(beside(tasks[2].run_dir, ".exit.json"), word)
+    for executor in (first, second):
+        assert [(e.task, e.code, e.said) for e in executor.poll()] == [(tasks[2], 130, "stopped")]
+        executor.start([tasks[2]])
+    assert [run_dirs for _, run_dirs, _ in queue.submitted[1:]] == [[str(tasks[2].run_dir)]]
+
+
+def test_a_failed_run_is_tried_again_though_its_batch_goes_on(tmp_path, queue):
+    made = make(tmp_path)
+    tasks = list(made.tasks.values())
+    Slurm(CONFIG, tmp_path).start(tasks)
+    name, _, _ = queue.submitted[0]
+    queue.alive.remove((name, 0))
+    write_json(beside(tasks[0].run_dir, ".exit.json"), {"batch": name, "code": 2, "said": "error: no"})
+    note_error(tasks[0].run_dir, "no")
+    with pytest.raises(Interrupted):
+        run_plan(made, _Stops(CONFIG, tmp_path), write(tmp_path))
+    assert len(queue.submitted) == 1
+    with pytest.raises(Interrupted):
+        run_plan(made, _Stops(CONFIG, tmp_path), write(tmp_path), retry=True)
+    assert [run_dirs for _, run_dirs, _ in queue.submitted[1:]] == [[str(tasks[0].run_dir)]]
+
+
+class _Stops(Slurm):
+    """Interrupted at the first poll."""
+
+    def poll(self):
+        assert super().poll() == []
+        raise KeyboardInterrupt
 
 
 def test_a_task_that_vanishes_without_a_word_is_reported_lost(tmp_path, queue):
@@ -171,6 +238,19 @@ def test_on_a_real_cluster_a_killed_driver_and_a_killed_worker_lose_nothing(clus
     assert (there / "table.txt").read_text() == (here / "table.txt").read_text()
     # Those that fail or finish were started once; those that are killed from within, once more.
     starts = [len((run_dir / "starts").read_text()) for run_dir in made.tasks]
+    assert starts == [1, 1, 1, 1, 2, 2]
+
+
+@pytest.mark.slow
+def test_on_a_real_cluster_two_drivers_started_together_run_everything_once(cluster, tmp_path):
+    spec = long_table(0.1)
+    here, there = tmp_path / "here", tmp_path / "there"
+    run_plan(make(here, table_without_deaths(spec)), Here(), write(here))
+    command = [sys.executable, "-m", "tests.tables.test_slurm", str(there)]
+    both = [subprocess.Popen(command, cwd=ROOT) for _ in range(2)]
+    assert [process.wait(300) for process in both] == [0, 0]
+    assert (there / "table.txt").read_text() == (here / "table.txt").read_text()
+    starts = [len((run_dir / "starts").read_text()) for run_dir in make(there, spec).tasks]
     assert starts == [1, 1, 1, 1, 2, 2]
 
 

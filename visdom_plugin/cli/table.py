@@ -130,7 +130,7 @@ def run_spec(spec: TableSpec, options: Options) -> tuple[int, Results | None]:
     summarise(Results(spec))
     made = plan(spec, runs, make_workshop(options), _read_roots(options))
     overview = Overview(quiet=options.quiet)
-    executor = _make_executor(spec, options, folder, overview.tick)
+    executor = _make_executor(spec, options, runs, overview.tick)
     if options.dry_run:
         sys.stdout.write("\n".join(describe_plan(made)) + "\n")
         return 0, None
@@ -328,7 +328,7 @@ def _read_roots(options: Options) -> dict[str, Path]:
     return roots
 
 
-def _make_executor(spec: TableSpec, options: Options, folder: Path, tick: Any) -> Any:
+def _make_executor(spec: TableSpec, options: Options, runs: Path, tick: Any) -> Any:
     from visdom_plugin.tables.executors import Here, Local
     from visdom_plugin.tables.slurm import Slurm, read_config
 
@@ -340,7 +340,7 @@ def _make_executor(spec: TableSpec, options: Options, folder: Path, tick: Any) -
     resources = read_config(spec, options.slurm)
     if kind == "process":
         return Here(tick)
-    return Local(options.workers or 1) if kind == "local" else Slurm(resources, folder)
+    return Local(options.workers or 1) if kind == "local" else Slurm(resources, runs)
 
 
 if __name__ == "__main__":

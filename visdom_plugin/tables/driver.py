@@ -80,16 +80,16 @@ def run_plan(
         ConfigError: when finished runs turn out to be of different protocols.
         Interrupted: after Ctrl-C or SIGTERM; what was running can be resumed, the table is written.
     """
+    asked_for = {j.run_dir for j in plan.jobs if only is None or j.row in only}
+    wanted = {run_dir: task for run_dir, task in plan.tasks.items() if run_dir in asked_for}
     if retry:
-        for run_dir in plan.tasks:
+        for run_dir in wanted:
             state.forget_error(run_dir)
     known = look(plan)
-    wanted = {j.run_dir for j in plan.jobs if j.run_dir and (only is None or j.row in only)}
     queue = [
         _Watched(task, step=state.read_step(run_dir))
-        for run_dir, task in plan.tasks.items()
-        if run_dir in wanted
-        and (known[run_dir].status == "waiting" or (retry and known[run_dir].status == "failed"))
+        for run_dir, task in wanted.items()
+        if known[run_dir].status == "waiting" or (retry and known[run_dir].status == "failed")
     ]
     for entry in queue:
         known[entry.task.run_dir] = Outcome("waiting")
@@ -100,7 +100,7 @@ def run_plan(
     overview = overview or Overview(quiet=True)
     table = _Table(plan, known, write)
     with overview, _term_interrupts():
-        overview.begin(plan, known, len(queue))
+        overview.begin(wanted, known)
         try:
             table.write()
             _work(queue, executor, table, overview)
@@ -149,6 +149,9 @@ def _work(queue: list[_Watched], executor: Executor, table: _Table, overview: Ov
         known[entry.task.run_dir] = Outcome("running")
     while queue or active:
         _start(queue, active, executor, table)
+        queued = executor.queued()
+        for run_dir in active:
+            known[run_dir] = Outcome("waiting" if run_dir in queued else "running")
         overview.show(known)
         for ended in executor.poll():
             entry = active.pop(ended.task.run_dir)
@@ -164,6 +167,7 @@ def _work(queue: list[_Watched], executor: Executor, table: _Table, overview: Ov
             time.sleep(executor.pause)
         elif queue and not active:
             time.sleep(0.2)
+    overview.show(known)
 
 
 def _start(queue: list[_Watched], active: dict[Path, _Watched], executor: Executor, table: _Table) -> None:
@@ -202,9 +206,13 @@ def _judge(entry: _Watched, ended: Ended) -> Outcome:
     """What the end of a task's process means: finished, failed, or to be run again ("waiting")."""
     run_dir = ended.task.run_dir
     outcome = state.read_outcome(run_dir)
-    if outcome.status == "finished":
+    busy = state.BUSY in ended.said and ended.code == 2
+    if ended.code is not None and not busy:
+        state.keep_log(run_dir, ended.said)
+    if outcome.status == "finished" or state.has_error(run_dir):
+        # Maybe by another driver.
         return outcome
-    if state.BUSY in ended.said and ended.code == 2:
+    if busy:
         entry.not_before = time.monotonic() + BUSY_PAUSE
         return Outcome("waiting")
     if ended.code is None or ended.code < 0 or ended.code == INTERRUPTED:

@@ -12,18 +12,18 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import IO, Protocol
 
 from visdom_plugin.tables.jobs import Task
-from visdom_plugin.tables.state import beside, read_json
-from visdom_plugin.training.files import write_bytes
+from visdom_plugin.tables.state import read_json
 
 INTERRUPTED = 130
 """Exit status of a command that a signal stopped in an orderly way."""
@@ -45,8 +45,6 @@ class Ended:
 class Executor(Protocol):
     """Runs tasks."""
 
-    lasting: bool
-    """Whether tasks go on without the driver."""
     pause: float
     """Seconds between two polls."""
 
@@ -62,19 +60,22 @@ class Executor(Protocol):
         """Starts up to `free()` tasks, whose settings are written."""
         ...
 
+    def queued(self) -> Collection[Path]:
+        """Run directories of started tasks that still wait for a place to run."""
+        ...
+
     def poll(self) -> list[Ended]:
         """Tasks that ended since the last call."""
         ...
 
     def stop(self) -> None:
-        """Stops what runs in a state that can be resumed, and waits for it; lets lasting ones go on."""
+        """Stops what would end with the driver, in a state that can be resumed, and waits for it."""
         ...
 
 
 class Here:
-    """One task at a time, in this process. `tick` is called every two seconds while one runs."""
+    """One task at a time, in this process. `tick` is called at its start and every two seconds while it runs."""
 
-    lasting = False
     pause = 0.0
 
     def __init__(self, tick: Callable[[], None] = lambda: None):
@@ -91,6 +92,7 @@ class Here:
         for task in tasks:
             said, done = io.StringIO(), threading.Event()
             levels = {name: logging.getLogger(name).level for name in ("visdom_plugin", "datamodules")}
+            self.tick()
             ticker = threading.Thread(target=self._watch, args=(done,), daemon=True)
             ticker.start()
             try:
@@ -106,11 +108,13 @@ class Here:
                 ticker.join()
                 for name, level in levels.items():
                     logging.getLogger(name).setLevel(level)
-            write_bytes(beside(task.run_dir, ".log"), said.getvalue().encode())
             if code == INTERRUPTED:
                 # The signal was meant for the whole table.
                 raise KeyboardInterrupt
             self._ended.append(Ended(task, code, said.getvalue()))
+
+    def queued(self) -> Collection[Path]:
+        return ()
 
     def poll(self) -> list[Ended]:
         ended, self._ended = self._ended, []
@@ -130,7 +134,6 @@ class Local:
     A child whose driver dies is told to stop by the kernel (Linux) and leaves a state that can be resumed.
     """
 
-    lasting = False
     pause = 0.2
 
     def __init__(self, workers: int, threads: int | None = None):
@@ -141,7 +144,8 @@ class Local:
         """
         self.workers = workers
         self.threads = threads or max(1, count_cores() // workers)
-        self._children: dict[subprocess.Popen, Task] = {}
+        self._children: dict[subprocess.Popen, tuple[Task, IO[bytes]]] = {}
+        """With what they say on stderr."""
 
     def free(self) -> int:
         return self.workers - len(self._children)
@@ -151,30 +155,30 @@ class Local:
 
     def start(self, tasks: Sequence[Task]) -> None:
         for task in tasks:
-            log = beside(task.run_dir, ".log")
-            log.parent.mkdir(parents=True, exist_ok=True)
-            with log.open("wb") as said:
-                command = [sys.executable, "-m", "visdom_plugin.tables.child", "--parent", str(os.getpid())]
-                child = subprocess.Popen(
-                    [*command, task.module, *task.argv],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=said,
-                    # A run goes on with the threads it began with: its result depends on them in the last digits.
-                    env=environment(
-                        (read_json(task.run_dir / "run.json") or {}).get("threads") or self.threads
-                    ),
-                    # Ctrl-C in a terminal reaches the driver alone, which then stops its children once.
-                    start_new_session=True,
-                )
-            self._children[child] = task
+            # Without a name: no other driver's child can write to it, and no killed driver leaves it behind.
+            said = tempfile.TemporaryFile()  # noqa: SIM115
+            command = [sys.executable, "-m", "visdom_plugin.tables.child", "--parent", str(os.getpid())]
+            child = subprocess.Popen(
+                [*command, task.module, *task.argv],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=said,
+                # A run goes on with the threads it began with: its result depends on them in the last digits.
+                env=environment((read_json(task.run_dir / "run.json") or {}).get("threads") or self.threads),
+                # Ctrl-C in a terminal reaches the driver alone, which then stops its children once.
+                start_new_session=True,
+            )
+            self._children[child] = task, said
+
+    def queued(self) -> Collection[Path]:
+        return ()
 
     def poll(self) -> list[Ended]:
         ended = []
-        for child, task in list(self._children.items()):
+        for child, (task, said) in list(self._children.items()):
             if child.poll() is not None:
                 del self._children[child]
-                ended.append(Ended(task, child.returncode, read_log(task.run_dir)))
+                ended.append(Ended(task, child.returncode, read_all(said)))
         return ended
 
     def stop(self) -> None:
@@ -187,11 +191,13 @@ class Local:
             except subprocess.TimeoutExpired:
                 child.send_signal(signal.SIGKILL)
                 child.wait()
+        for _, said in self._children.values():
+            said.close()
         self._children.clear()
 
     def processes(self) -> dict[int, Task]:
         """Process ids of what runs now."""
-        return {child.pid: task for child, task in self._children.items()}
+        return {child.pid: task for child, (task, _) in self._children.items()}
 
 
 def environment(threads: int) -> Mapping[str, str]:
@@ -205,9 +211,8 @@ def count_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def read_log(run_dir: Path) -> str:
-    """What a task's command wrote on stderr."""
-    try:
-        return beside(run_dir, ".log").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return ""
+def read_all(said: IO[bytes]) -> str:
+    """Everything that was written to a temporary file, which is closed."""
+    with said:
+        said.seek(0)
+        return said.read().decode(errors="replace")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
-from visdom_plugin.tables.jobs import Plan, Task
+from visdom_plugin.tables.jobs import Task
 from visdom_plugin.tables.results import Outcome
 from visdom_plugin.tables.state import read_step
 
@@ -27,7 +29,7 @@ class Overview:
         self.quiet = quiet
         self.stream = sys.stderr if stream is None else stream
         self._bar: Any = None
-        self._plan: Plan | None = None
+        self._tasks: Mapping[Path, Task] = {}
         self._known: Mapping[Path, Outcome] = {}
         self._shown = 0.0
 
@@ -39,14 +41,15 @@ class Overview:
             self._bar.stop()
             self._bar = None
 
-    def begin(self, plan: Plan, known: Mapping[Path, Outcome], to_run: int) -> None:
-        """Says what there is to do."""
-        self._plan, self._known = plan, known
+    def begin(self, tasks: Mapping[Path, Task], known: Mapping[Path, Outcome]) -> None:
+        """Says what there is to do of some tasks, by run directory; those that are waiting are to be run."""
+        self._tasks, self._known = tasks, known
         self._begin = self._shown = time.monotonic()
-        self._share_before = (len(known) - to_run) / max(len(known), 1)
         if self.quiet:
             return
-        if to_run and self.stream.isatty():
+        counts = self._count()
+        self._before = {d: self._reached(d) for d in tasks if known[d].status == "waiting"}
+        if counts["waiting"] and self.stream.isatty():
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -60,7 +63,11 @@ class Overview:
             )
             self._bar.start()
             self._line = self._bar.add_task("", total=1.0, note="")
-        self._say(f"{len(known)} runs in all, {len(known) - to_run} of them done before, {to_run} to do")
+        failed = f", {counts['failed']} failed before" if counts["failed"] else ""
+        self._say(
+            f"{len(tasks)} run{'s' * (len(tasks) != 1)} in all, {counts['finished']} of them done before{failed}, "
+            f"{counts['waiting']} to do"
+        )
 
     def show(self, known: Mapping[Path, Outcome]) -> None:
         """Brings the display up to date; to be called often."""
@@ -83,7 +90,8 @@ class Overview:
             self._say(f"failed: {task.label}\n  " + (outcome.error or "").replace("\n", "\n  "))
         elif self._bar is None:
             self._say(f"finished: {task.label}")
-        self._draw()
+        # Not drawn at once: what runs next is not started yet.
+        self._shown = -math.inf
 
     def _draw(self) -> None:
         note, share = self._summarise()
@@ -98,46 +106,54 @@ class Overview:
         else:
             print(text, file=self.stream, flush=True)
 
+    def _count(self) -> Counter[str]:
+        return Counter(self._known[run_dir].status for run_dir in self._tasks)
+
     def _summarise(self) -> tuple[str, float]:
-        known = list(self._known.items())
-        counts = {s: sum(o.status == s for _, o in known) for s in ("finished", "failed", "running")}
+        counts = self._count()
+        shares = {run_dir: self._share(run_dir) for run_dir in self._tasks}
         done = counts["finished"] + counts["failed"]
-        shares = {d: self._share(d, o) for d, o in known}
-        share = sum(shares.values()) / max(len(shares), 1)
-        note = f"{done}/{len(known)} done, {counts['running']} running"
+        note = f"{done}/{len(shares)} done, {counts['running']} running"
         note += f", {counts['failed']} failed" if counts["failed"] else ""
-        left = self._estimate(shares, share)
-        if left is not None and done < len(known):
+        left = self._estimate(shares, counts["running"])
+        if left is not None:
             note += f", about {spell_seconds(left)} left"
-        return note, share
+        return note, sum(shares.values()) / max(len(shares), 1)
 
-    def _share(self, run_dir: Path, outcome: Outcome) -> float:
-        if outcome.status in ("finished", "failed"):
+    def _share(self, run_dir: Path) -> float:
+        status = self._known[run_dir].status
+        if status in ("finished", "failed"):
             return 1.0
-        steps = self._plan.tasks[run_dir].steps
-        # After the last step comes the evaluation.
-        return 0.9 * min(read_step(run_dir) / steps, 1.0) if outcome.status == "running" and steps else 0.0
+        return self._reached(run_dir) if status == "running" else 0.0
 
-    def _estimate(self, shares: dict[Path, float], share: float) -> float | None:
+    def _reached(self, run_dir: Path) -> float:
+        steps = self._tasks[run_dir].steps
+        # After the last step comes the evaluation.
+        return 0.9 * min(read_step(run_dir) / steps, 1.0) if steps else 0.0
+
+    def _estimate(self, shares: Mapping[Path, float], running: int) -> float | None:
         """Seconds left: by what finished runs of the same method, or of any, took on average; before the first, by
-        the steps done since the begin."""
+        the steps done since the begin. None where nothing runs or nothing is known yet."""
+        if not running:
+            return None
         took: dict[str, list[float]] = {}
-        for run_dir, outcome in self._known.items():
-            timing = (outcome.record or {}).get("timing") or {}
+        for run_dir, task in self._tasks.items():
+            timing = (self._known[run_dir].record or {}).get("timing") or {}
             seconds = sum(
                 v for k in ("hull_s", "train_s", "eval_s") if isinstance(v := timing.get(k), (int, float))
             )
             if seconds:
-                took.setdefault(self._plan.tasks[run_dir].method, []).append(seconds)
+                took.setdefault(task.method, []).append(seconds)
         every = [s for values in took.values() for s in values]
+        to_do = len(shares) - sum(shares.values())
         if not every:
-            gained = share - self._share_before
-            return (time.monotonic() - self._begin) * (1 - share) / gained if gained > 0 else None
+            gained = sum(max(shares[run_dir] - share, 0.0) for run_dir, share in self._before.items())
+            return (time.monotonic() - self._begin) * to_do / gained if gained > 0 else None
         left = 0.0
         for run_dir, share in shares.items():
-            values = took.get(self._plan.tasks[run_dir].method, every)
+            values = took.get(self._tasks[run_dir].method, every)
             left += (1 - share) * sum(values) / len(values)
-        return left / max(1, sum(o.status == "running" for o in self._known.values()))
+        return left / running
 
 
 def spell_seconds(seconds: float) -> str:

@@ -3,8 +3,8 @@
 Slurm's own accounting is not needed: a task leaves a file when it ends, and squeue tells which ones are still
 queued or running. The table's folder must be visible on the nodes under the same path.
 
-A driver may die at any moment without a task being submitted twice: the name of a batch is on disk before the
-batch is submitted, and a new driver asks the cluster for the jobs of that name.
+A driver may die at any moment, and others may work beside it, without a task being submitted twice: the name of a
+batch is on disk before the batch is submitted (see tables.batches), and whoever submits looks there first.
 """
 
 from __future__ import annotations
@@ -16,14 +16,16 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from visdom_plugin.errors import ConfigError, VisDomError
-from visdom_plugin.tables.executors import PATIENCE, Ended, environment, read_log
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.tables.batches import Notes, Place, SlurmError, find_places, look_up
+from visdom_plugin.tables.executors import PATIENCE, Ended, environment, read_all
 from visdom_plugin.tables.jobs import Task
 from visdom_plugin.tables.spec import TableSpec
 from visdom_plugin.tables.state import beside, read_json
@@ -32,16 +34,12 @@ from visdom_plugin.training.settings import from_plain
 
 ARRAY = 1000
 """Tasks per array: Slurm's default MaxArraySize is 1001."""
-SUBMITTING = 15.0
-"""Seconds after which a batch that was about to be submitted is in the queue, or will never be."""
+RUNNING = ("RUNNING", "COMPLETING")
+"""States of jobs that have left the line."""
 ABSENT = 3
 """A task that the queue does not list so many times in a row, and that left no word, is lost."""
 
 log = logging.getLogger(__name__)
-
-
-class SlurmError(VisDomError):
-    """The cluster cannot be asked, or refuses a job."""
 
 
 @dataclass(frozen=True)
@@ -91,12 +89,11 @@ def read_config(spec: TableSpec, file: Path | None) -> SlurmConfig:
 class Slurm:
     """Submits tasks as arrays and watches them. They go on when the driver is stopped."""
 
-    lasting = True
-
     def __init__(self, config: SlurmConfig, folder: Path):
         """
         Args:
-            folder: of the table; `slurm.json` says there what was submitted, `slurm/` holds submitit's files.
+            folder: of the run directories; `slurm.json` says there what any table submitted, `slurm/` holds
+                submitit's files.
 
         Raises:
             ConfigError: when submitit or Slurm's commands are not installed.
@@ -115,9 +112,10 @@ class Slurm:
             )
         self.config, self.folder = config, Path(folder).resolve()
         self.pause = min(2.0, config.poll_seconds)
-        self._notes = self.folder / "slurm.json"
-        self._active: dict[Path, tuple[Task, str, int]] = {}
-        """Run directory to task, batch name, position in the batch."""
+        self._notes = Notes(self.folder)
+        self._active: dict[Path, tuple[Task, Place]] = {}
+        """By run directory."""
+        self._running: set[Path] = set()
         self._absent: dict[Path, int] = {}
         self._asked = 0.0
 
@@ -125,24 +123,21 @@ class Slurm:
         return 10 * ARRAY
 
     def adopt(self, tasks: Sequence[Task]) -> list[Task]:
-        """Tasks that an earlier driver submitted and that are queued, running, or ended with a word."""
-        wanted = {task.run_dir.name: task for task in tasks}
-        batches = self._read_notes()
-        for name, batch in batches.items():
-            alive = self._alive([name])
-            while batch.get("id") is None and not alive and time.time() - batch.get("time", 0) < SUBMITTING:
-                time.sleep(1)
-                alive = self._alive([name])
-            for index, run in enumerate(batch["runs"]):
-                if run in wanted and ((name, index) in alive or self._word(wanted[run], name) is not None):
-                    self._active[wanted[run].run_dir] = (wanted[run], name, index)
+        """Tasks that another driver submitted and that are queued, running, or ended with a word."""
+        batches = self._notes.read()
+        places, queue = find_places(batches), look_up(batches)
+        for task in tasks:
+            place = places.get(task.run_dir.name)
+            if place is not None and (place in queue or _read_word(task, place) is not None):
+                self._active[task.run_dir] = task, place
+        self._note_running(queue)
         self._forget_ended()
         if self._active:
             log.info("%d runs are on the cluster already", len(self._active))
-        return [task for task, _, _ in self._active.values()]
+        return [task for task, _ in self._active.values()]
 
     def start(self, tasks: Sequence[Task]) -> None:
-        """Submits tasks as arrays.
+        """Submits tasks as arrays, and adopts those that another driver submitted in the meantime.
 
         Raises:
             SlurmError: when sbatch refuses.
@@ -150,24 +145,20 @@ class Slurm:
         for begin in range(0, len(tasks), ARRAY):
             self._submit(list(tasks[begin : begin + ARRAY]))
 
+    def queued(self) -> Collection[Path]:
+        return self._active.keys() - self._running
+
     def poll(self) -> list[Ended]:
         ended = []
-        for run_dir, (task, name, _) in list(self._active.items()):
-            code = self._word(task, name)
-            if code is not None:
-                ended.append(Ended(task, code, read_log(run_dir)))
-        if time.monotonic() - self._asked >= self.config.poll_seconds and len(ended) < len(self._active):
-            self._asked = time.monotonic()
-            alive = self._alive(sorted({name for _, name, _ in self._active.values()}))
-            gone = {e.task.run_dir for e in ended}
-            for run_dir, (task, name, index) in self._active.items():
-                there = (name, index) in alive
-                self._absent[run_dir] = 0 if there else self._absent.get(run_dir, 0) + 1
-                if run_dir not in gone and self._absent[run_dir] >= ABSENT:
-                    ended.append(Ended(task, None, read_log(run_dir)))
+        for run_dir, (task, place) in self._active.items():
+            word = _read_word(task, place)
+            if word is not None:
+                ended.append(Ended(task, int(word["code"]), str(word.get("said", ""))))
+                self._absent.pop(run_dir, None)
         for end in ended:
             del self._active[end.task.run_dir]
-            self._absent.pop(end.task.run_dir, None)
+        if self._active and time.monotonic() - self._asked >= self.config.poll_seconds:
+            ended += [Ended(task, None) for task in self._find_lost()]
         if ended:
             self._forget_ended()
         return ended
@@ -175,7 +166,7 @@ class Slurm:
     def stop(self) -> None:
         """Leaves the jobs to the cluster and says so."""
         if self._active:
-            names = ",".join(sorted({name for _, name, _ in self._active.values()}))
+            names = ",".join(sorted({name for _, (name, _) in self._active.values()}))
             log.warning(
                 "%d runs stay on the cluster; the same command finds them again, `scancel --name=%s` ends them",
                 len(self._active),
@@ -186,9 +177,12 @@ class Slurm:
         import submitit
 
         name = f"visdom-{secrets.token_hex(4)}"
-        batches = self._read_notes()
-        batches[name] = {"id": None, "time": time.time(), "runs": [task.run_dir.name for task in tasks]}
-        write_json(self._notes, {"batches": batches})
+        with self._notes.changing() as batches:
+            tasks = self._leave_out_submitted(tasks, batches)
+            if not tasks:
+                return
+            note = {"id": None, "time": time.time(), "runs": [task.run_dir.name for task in tasks]}
+            batches[name] = note
         c = self.config
         wanted = {
             "slurm_job_name": name,
@@ -222,62 +216,71 @@ class Slurm:
         except Exception as error:
             if type(error).__name__ != "FailedJobError":
                 raise
-            batches.pop(name)
-            write_json(self._notes, {"batches": batches})
+            with self._notes.changing() as batches:
+                batches.pop(name, None)
             raise SlurmError(
                 f"the cluster refuses the jobs: {error}",
                 where=f"{len(tasks)} tasks, {c}",
                 todo="change the resources in the table's `slurm:` or with --slurm FILE",
             ) from error
-        batches[name]["id"] = str(jobs[0].job_id).partition("_")[0]
-        write_json(self._notes, {"batches": batches})
+        with self._notes.changing() as batches:
+            batches[name] = note | {"id": str(jobs[0].job_id).partition("_")[0]}
         for index, task in enumerate(tasks):
-            self._active[task.run_dir] = (task, name, index)
+            self._active[task.run_dir] = task, (name, index)
 
-    def _alive(self, names: Sequence[str]) -> set[tuple[str, int]]:
-        """Batch names and positions of the jobs that the queue lists."""
-        if not names:
-            return set()
-        command = ["squeue", "--noheader", "--array", f"--name={','.join(names)}", "--format=%j|%K|%T"]
-        for attempt in range(3):
-            try:
-                said = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
-                break
-            except (subprocess.SubprocessError, OSError) as error:
-                if attempt == 2:
-                    reason = getattr(error, "stderr", None) or error
-                    raise SlurmError(f"the cluster's queue cannot be read: {str(reason).strip()}") from error
-                time.sleep(2)
-        alive = set()
-        for line in said.splitlines():
-            name, index, state = line.strip().split("|")
-            if state not in ("COMPLETED", "FAILED", "CANCELLED", "TIMEOUT", "NODE_FAIL", "OUT_OF_MEMORY"):
-                # A batch of one is no array.
-                alive.add((name, int(index) if index.isdecimal() else 0))
-        return alive
+    def _leave_out_submitted(self, tasks: Sequence[Task], batches: Mapping[str, Any]) -> list[Task]:
+        """The tasks that are not on the cluster; the others are watched like those of this driver."""
+        places = find_places(batches)
+        noted = {places[task.run_dir.name][0] for task in tasks if task.run_dir.name in places}
+        queue = look_up({name: batches[name] for name in noted})
+        left = []
+        for task in tasks:
+            place = places.get(task.run_dir.name)
+            # A job that left its word is over, though the queue may list it for a while.
+            if place in queue and _read_word(task, place) is None:
+                self._active[task.run_dir] = task, place
+            else:
+                left.append(task)
+        return left
 
-    def _word(self, task: Task, batch: str) -> int | None:
-        """The exit status that a task of this batch left."""
-        word = read_json(beside(task.run_dir, ".exit.json"))
-        return int(word["code"]) if word is not None and word.get("batch") == batch else None
+    def _find_lost(self) -> list[Task]:
+        """Asks the queue. Tasks that it did not list ABSENT times in a row; they are no longer watched."""
+        self._asked = time.monotonic()
+        notes = self._notes.read()
+        queue = look_up({name: notes.get(name, {}) for _, (name, _) in self._active.values()})
+        self._note_running(queue)
+        lost = []
+        for run_dir, (task, place) in list(self._active.items()):
+            self._absent[run_dir] = 0 if place in queue else self._absent.get(run_dir, 0) + 1
+            if self._absent[run_dir] >= ABSENT:
+                del self._active[run_dir], self._absent[run_dir]
+                lost.append(task)
+        return lost
 
-    def _read_notes(self) -> dict[str, Any]:
-        return dict((read_json(self._notes) or {}).get("batches") or {})
+    def _note_running(self, queue: Mapping[Place, str]) -> None:
+        self._running = {d for d, (_, place) in self._active.items() if queue.get(place) in RUNNING}
 
     def _forget_ended(self) -> None:
         """Removes batches from the notes of which nothing is left on the cluster."""
-        batches = self._read_notes()
-        names = {name for _, name, _ in self._active.values()}
-        alive = {name for name, _ in self._alive([name for name in batches if name not in names])}
-        kept = {name: batch for name, batch in batches.items() if name in names | alive}
-        if kept != batches:
-            write_json(self._notes, {"batches": kept})
+        watched = {name for _, (name, _) in self._active.values()}
+        others = {name: batch for name, batch in self._notes.read().items() if name not in watched}
+        ended = others.keys() - {name for name, _ in look_up(others)}
+        if ended:
+            with self._notes.changing() as batches:
+                for name in ended:
+                    batches.pop(name, None)
+
+
+def _read_word(task: Task, place: Place) -> dict[str, Any] | None:
+    """What a task that ran there left when it ended."""
+    word = read_json(beside(task.run_dir, ".exit.json"))
+    return word if word is not None and word.get("batch") == place[0] else None
 
 
 def run_task(module: str, argv: list[str], run_dir: str, batch: str, cpus: int) -> int:
     """Runs on the node: the task in a process of its own, and a word on how it ended."""
     path = Path(run_dir)
-    with beside(path, ".log").open("wb") as said:
+    with tempfile.TemporaryFile() as said:
         child = subprocess.Popen(
             [sys.executable, "-m", "visdom_plugin.tables.child", "--parent", str(os.getpid()), module, *argv],
             stdin=subprocess.DEVNULL,
@@ -291,5 +294,6 @@ def run_task(module: str, argv: list[str], run_dir: str, batch: str, cpus: int) 
             child.send_signal(signal.SIGTERM)
             child.wait(PATIENCE)
             raise
-    write_json(beside(path, ".exit.json"), {"batch": batch, "code": code})
+        word = {"batch": batch, "code": code, "said": read_all(said)}
+    write_json(beside(path, ".exit.json"), word)
     return code

@@ -2,8 +2,9 @@
 
 runs/<name>/            the run directory of the job's command
 runs/<name>.yaml        its settings, for --config
-runs/<name>.log         what the command said on stderr
+runs/<name>.log         what the command said on stderr, once it ended
 runs/<name>.error.json  why it failed: only of jobs that did
+runs/<name>.exit.json   how the command ended on a cluster
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from visdom_plugin.tables.results import Outcome
-from visdom_plugin.training.files import MARK, write_json
+from visdom_plugin.training.files import MARK, write_bytes, write_json
 
 BUSY = "another process is training into this run directory"
 """What a command says that finds its run directory held by a living process."""
@@ -54,6 +55,11 @@ def note_error(run_dir: Path, error: str) -> None:
     write_json(beside(run_dir, ".error.json"), {"error": error})
 
 
+def keep_log(run_dir: Path, said: str) -> None:
+    """Keeps what the command said on stderr."""
+    write_bytes(beside(run_dir, ".log"), said.encode())
+
+
 def has_error(run_dir: Path) -> bool:
     """Whether a failure was noted."""
     return beside(run_dir, ".error.json").exists()
@@ -61,7 +67,8 @@ def has_error(run_dir: Path) -> bool:
 
 def forget_error(run_dir: Path) -> None:
     """Lets a failed job be tried again."""
-    beside(run_dir, ".error.json").unlink(missing_ok=True)
+    for suffix in (".error.json", ".exit.json"):
+        beside(run_dir, suffix).unlink(missing_ok=True)
 
 
 def read_step(run_dir: Path) -> int:
