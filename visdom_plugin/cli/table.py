@@ -157,7 +157,7 @@ def run_spec(spec: TableSpec, options: Options) -> tuple[int, Results | None]:
             say(
                 f"{failed} of {len(results.outcomes)} runs failed; the same command with --retry tries them again"
             )
-        for path in sorted(folder.glob("table.*")):
+        for path in sorted(folder.glob("table*.*")):
             say(f"written: {path}")
     return FAILURES if failed else 0, results
 
@@ -274,12 +274,12 @@ def _resolve(kind: str, method: str, budget: str, options: Options) -> Any:
     budget, _ = choose_budget([f"--budget={budget}", f"--device={options.device}"], {})
     try:
         preset = registry.find(method)
-    except ConfigError as error:
+    except ConfigError:
         known = registry.installed()
         if not known.presets:
             raise
         _refuse_misspelt(method, [*known.presets, *known.aliases])
-        log.warning("not available: %s", error.what)
+        log.warning("not available: no installed package offers %r", method)
         return None
     return Resolved(preset.name, budget, getattr(preset, budget))
 
