@@ -9,7 +9,7 @@ import pickle
 import re
 import subprocess
 import sys
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import EntryPoint, entry_points
 
 import pytest
@@ -151,6 +151,43 @@ def test_settings_with_fields_added_are_data_as_any_other():
     assert MethodSpec("other", TARGET, Plain(3), hook="sampler").presets()["other"].quick == replace(
         bare, width=3, steps=7
     )
+
+
+@dataclass(frozen=True)
+class Strict:
+    """Checks itself."""
+
+    steps: int = 7
+
+    def __post_init__(self):
+        if self.steps < 1:
+            raise ConfigError("steps is below 1")
+
+
+@dataclass(frozen=True)
+class Dropping(Strict):
+    """Has settings of the hook of its own."""
+
+    vd: SamplerConfig = field(default_factory=SamplerConfig)
+
+
+def test_dropping_samples_is_refused_where_the_method_does_not_say_that_it_does():
+    on = SamplerConfig(enabled=True, drop_outside=True)
+    for config in (Plain(3), Frozen(), Strict()):
+        vd = MethodSpec("m", TARGET, config, hook="sampler").presets()["m+vd"].quick
+        with pytest.raises(ConfigError, match="drop_outside") as caught:
+            replace(vd, vd=on)
+        assert caught.value.todo and type(config).__name__ in caught.value.where
+        with pytest.raises(ConfigError, match="drop_outside"):
+            from_plain(vd, as_plain(vd) | {"vd": as_plain(on)}, "here")
+    preset = MethodSpec("m", TARGET, Dropping(), hook="sampler").presets()["m+vd"]
+    assert replace(preset.quick, vd=on).vd.drop_outside
+
+
+def test_settings_with_fields_added_are_checked_as_before():
+    for preset in MethodSpec("m", TARGET, Strict(), hook="sampler").presets().values():
+        with pytest.raises(ConfigError, match="below 1"):
+            replace(preset.quick, steps=0)
 
 
 def test_a_method_without_a_hook_stays_as_it_is():

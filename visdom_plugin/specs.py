@@ -12,7 +12,7 @@ from functools import cache
 from importlib import import_module
 from typing import Any, Literal
 
-from visdom_plugin.errors import PluginError
+from visdom_plugin.errors import ConfigError, PluginError
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
 from visdom_plugin.hull.domain import VisibleDomain
 
@@ -93,6 +93,7 @@ class MethodSpec:
         config.hull          None, and the VisibleDomain to carve in +vd; the hull arrives in `setup`
         config.vd            the hook's settings, off but in +vd; the hook itself arrives in `setup(hooks=[...])`
 
+    Single samples few methods drop: `vd.drop_outside` is refused, unless the config has a field `vd` of its own.
     `visdom_plugin.hooks.protocols` says what the two kinds of hook do and what is expected of a method.
 
     Raises:
@@ -210,7 +211,8 @@ class MethodSpec:
 def extend(config_class: type, hook: str) -> type:
     """The config class with the fields that the variants set; the class itself where it has them all.
 
-    Instances of the result are instances of `config_class`, can be pickled, and are constructed alike.
+    Instances of the result are instances of `config_class`, can be pickled, and are constructed alike. With a
+    field `vd` that is added, they refuse `drop_outside`, which needs more of a method than to bound its rays.
     """
     own = {f.name for f in fields(config_class)}
     settings = HOOKS[hook]
@@ -222,6 +224,18 @@ def extend(config_class: type, hook: str) -> type:
     added = [item for item in offered if item[0] not in own]
     if not added:
         return config_class
+
+    def check(self: Any, *rest: Any) -> None:
+        if hasattr(config_class, "__post_init__"):
+            config_class.__post_init__(self, *rest)
+        if "vd" not in own and getattr(self.vd, "drop_outside", False):
+            raise ConfigError(
+                "vd.drop_outside is on, but the method does not say that it drops single samples",
+                where=f"{config_class.__name__}, --method.vd.drop-outside",
+                todo="leave it off, or train method:vaxnerf; a method that asks the hook's keep() about each "
+                "sample says so by a field vd: SamplerConfig in its config",
+            )
+
     documents = {
         "mask_weight": "Weight of the binary cross entropy between rendered opacity and mask.",
         "hull": "The hull of the visible-domain hook; carved when there is one.",
@@ -234,6 +248,7 @@ def extend(config_class: type, hook: str) -> type:
         frozen=config_class.__dataclass_params__.frozen,
         kw_only=True,
         namespace={
+            "__post_init__": check,
             "__reduce__": lambda self: (
                 _rebuild,
                 (config_class, hook, {f.name: getattr(self, f.name) for f in fields(self) if f.init}),

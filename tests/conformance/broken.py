@@ -5,7 +5,7 @@ Named by VISDOM_METHODS, as a stranger's code is before it is installed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -36,8 +36,26 @@ def breaks(check: str, vd: type | None = None):
     return take
 
 
+@dataclass(frozen=True)
+class TinyField:
+    steps: int = 24
+    rays: int = 96
+    samples: int = 16
+    resolution: int = 16
+    radius: float = 0.4
+
+
+@dataclass(frozen=True)
+class DroppingField(TinyField):
+    """Says of its method that it drops single samples: it has the hook's settings of its own."""
+
+    vd: SamplerConfig = field(default_factory=SamplerConfig)
+
+
 class Field(WholeField):
     """Whole but for the mesh, which takes longest."""
+
+    settings = TinyField
 
     def export(self, folder):
         np.save(folder / "grid.npy", self.grid.detach().cpu().numpy())
@@ -140,12 +158,49 @@ class HitOnly(Field):
 
 @breaks("test_opacity_outside_the_hull_falls")
 class Hazy(Field):
-    """Shows a haze where nothing is, but only with its hooks."""
+    """Shows a haze where nothing is, but only with its hooks, and without the hull at inference."""
 
     def render(self, camera, background):
         shown = super().render(camera, background)
-        haze = 0.8 * (1 - shown.alpha) if self.hooks else torch.zeros_like(shown.alpha)
+        hazy = self.hooks and not self.config.vd.hull_at_inference
+        haze = 0.8 * (1 - shown.alpha) if hazy else torch.zeros_like(shown.alpha)
         return replace(shown, rgb=shown.rgb - haze[..., None] * background, alpha=shown.alpha + haze)
+
+
+class ToldSo(Field):
+    """Renders as it is told to by itself, whatever the settings say."""
+
+    told: bool
+
+    def render(self, camera, background):
+        config = self.config
+        self.config = replace(config, vd=replace(config.vd, hull_at_inference=self.told))
+        shown = super().render(camera, background)
+        self.config = config
+        return shown
+
+
+@breaks("test_the_hull_has_no_part_in_novel_views_unless_asked_for")
+class AlwaysInside(ToldSo):
+    told = True
+
+
+@breaks("test_the_hull_at_inference_bounds_novel_views")
+class NeverInside(ToldSo):
+    told = False
+
+
+@breaks("test_the_hull_at_inference_bounds_novel_views")
+class ShowsMisses(Field):
+    """Bounds the rays of novel views, but shows what is along those that miss the hull."""
+
+    def trace(self, *rays, training=False):
+        return super().trace(*rays, training=True)
+
+
+@breaks("test_samples_outside_the_hull_are_dropped_where_the_setting_is_taken")
+class KeepsAll(Field):
+    settings = DroppingField
 
 
 class Around:
@@ -241,19 +296,10 @@ class Hoarder(GsGo):
         self.hooks = [Changed(h, after_step=lambda *x, h=h: (h.after_step(*x), None)[1]) for h in hooks]
 
 
-@dataclass(frozen=True)
-class TinyField:
-    steps: int = 24
-    rays: int = 96
-    samples: int = 16
-    resolution: int = 16
-    radius: float = 0.4
-
-
-def _field_spec(name: str, target: str, vd: type | None) -> MethodSpec:
+def _field_spec(name: str, target: str, settings: type, vd: type | None) -> MethodSpec:
     own = {} if vd is None else {"vd": vd(enabled=True)}
     return MethodSpec(
-        name, target, TinyField(), hook="sampler", variants={"mask": {}, "vd": {"hull": HULL} | own}
+        name, target, settings(), hook="sampler", variants={"mask": {}, "vd": {"hull": HULL} | own}
     )
 
 
@@ -273,14 +319,14 @@ def _field_presets(name: str, target: str, module, **small) -> list[Preset]:
 
 
 def _methods() -> list[MethodSpec | Preset]:
-    found: list[MethodSpec | Preset] = [_field_spec("SmallField", "my_method.field:Field", None)]
+    found: list[MethodSpec | Preset] = [_field_spec("SmallField", "my_method.field:Field", TinyField, None)]
     for name, (broken, vd) in CLASSES.items():
         target = f"{__name__}:{name}"
         globals().setdefault(name, broken)
         found += (
             _splat_presets(name, target, gs_go)
             if issubclass(broken, GsGo)
-            else [_field_spec(name, target, vd)]
+            else [_field_spec(name, target, broken.settings, vd)]
         )
     found += _splat_presets("SmallGsGo", "visdom_plugin.methods.gs_go:GsGo", gs_go)
     found += _splat_presets("SmallCorgs", "visdom_plugin.methods.corgs_lite:CorgsLite", corgs_lite)

@@ -104,6 +104,46 @@ def test_march_equals_its_torch_twin_and_any_number_of_threads(grid):
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("walk", [march, _march_torch])
+def test_samples_of_rays_that_start_outside_are_those_within_the_cube(walk):
+    draw = generator(6)
+    origins = 3 * torch.rand(500, 3, generator=draw) - 1.5
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=draw), dim=-1)
+    step, shift = torch.full((500,), 0.05), torch.rand(500, generator=draw)
+    grid = OccupancyGrid(8, 1.0, threshold=1.0)
+    found = walk(origins, directions, torch.zeros(500), torch.full((500,), 4.0), step, shift, grid)
+    middles = (torch.arange(79) + 0.5 + shift[:, None]) * 0.05
+    depth = 1 - (origins[:, None] + middles[..., None] * directions[:, None]).abs().amax(-1)
+    counts = found.ray_offsets.diff()
+    # On a face, rounding decides.
+    assert ((depth > 1e-3).sum(1) <= counts).all() and (counts <= (depth > -1e-3).sum(1)).all()
+
+
+def test_rays_cut_to_the_cube_are_sampled_to_their_ends():
+    """Where they leave by a lower face, rounding may put the last middle outside."""
+    origins, directions, _, leave, *_ = make_rays(20_000, seed=4)
+    lower = (origins + leave[:, None] * directions).amin(-1) < -0.9999
+    rays = [x[lower] for x in (origins, directions, leave - 0.01, leave)]
+    step, shift = torch.full((len(rays[0]),), 0.01), torch.full((len(rays[0]),), 0.49999)
+    samples = march(*rays, step, shift, OccupancyGrid(128, 1.0, threshold=1.0))
+    assert lower.sum() > 5000 and (samples.ray_offsets.diff() == 1).all()
+
+
+@pytest.mark.parametrize("walk", [march, _march_torch])
+def test_no_rays_have_no_samples(grid, walk):
+    offsets, ray, starts, ends = walk(*(x[:0] for x in make_rays()), grid)
+    assert offsets.tolist() == [0] and (ray.dtype, starts.dtype) == (torch.int64, torch.float32)
+    assert len(ray) == len(starts) == len(ends) == 0
+
+
+def test_rays_beside_the_cube_reach_nothing():
+    """Less than a cell away from each face, along it."""
+    grid = OccupancyGrid(8, 1.0, threshold=1.0)
+    away, along = 1.1 * torch.cat([torch.eye(3), -torch.eye(3)]), torch.eye(3).roll(1, 0).repeat(2, 1)
+    grid.restrict(away - along, along, torch.zeros(6), torch.full((6,), 2.0))
+    assert not grid.reachable.any()
+
+
 def test_unsampled_cells_stay_empty_for_ever():
     origins, directions, near, far, *_ = make_rays(25)
     grid = OccupancyGrid(16, 1.0, threshold=1.0)

@@ -119,6 +119,11 @@ class Subject:
         """Steps of the runs that are compared with the beginning of a long one."""
         return max(1, self.length // 4)
 
+    @property
+    def half(self) -> int:
+        """Steps of the runs with a probe in the hook's place."""
+        return self.length // 2 + 1
+
     @cached_property
     def trained(self) -> Run:
         """The main variant after `length` steps, its state kept after a quarter, a half and three quarters."""

@@ -17,11 +17,13 @@ class SamplerProbe:
 
     `place` is where that is: "near" or "far", at the end of the method's own bounds and of no length, with
     hit = False; or a factor of the distance to what the cameras look at, of `width` times that, with hit = True.
+    With "missed", bounds stay and hit is False; with "nowhere", bounds stay and `keep` keeps no sample.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, drop_outside: bool = False) -> None:
         self.place: str | float | None = None
         self.width = 1e-3
+        self.drop_outside = drop_outside
         self.calls = 0
         self.centre = look_at_point(scene().train.cameras)
 
@@ -30,8 +32,10 @@ class SamplerProbe:
         shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
         near, far = (torch.as_tensor(x).to(directions).expand(shape) for x in (near, far))
         everywhere = torch.ones(shape, dtype=torch.bool, device=directions.device)
-        if self.place is None:
+        if self.place in (None, "nowhere"):
             return RayBounds(near, far, everywhere)
+        if self.place == "missed":
+            return RayBounds(near, far, ~everywhere)
         if isinstance(self.place, str):
             end = near if self.place == "near" else far
             return RayBounds(end, end, ~everywhere)
@@ -39,6 +43,9 @@ class SamplerProbe:
         away = away.to(directions).expand(shape)
         begin = torch.minimum(torch.maximum(self.place * away, near), far)
         return RayBounds(begin, torch.minimum(begin + self.width * away, far), everywhere)
+
+    def keep(self, points: Tensor) -> Tensor:
+        return torch.full(points.shape[:-1], self.place != "nowhere", device=points.device)
 
 
 class GaussianProbe:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
 import pytest
 import torch
 
@@ -9,7 +13,11 @@ from datamodules.manager import DataManager
 from visdom_plugin.conformance.bench import carve, mass_outside, scene
 from visdom_plugin.conformance.probes import GaussianProbe, SamplerProbe, distance, gradient
 from visdom_plugin.conformance.report import require
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import GaussianHook, SamplerHook
+from visdom_plugin.hooks.sampler import VisDomSampler
+from visdom_plugin.training.protocols import Method
 from visdom_plugin.training.run import choose_batches
 
 PLACES = {
@@ -20,29 +28,24 @@ PLACES = {
     "a thousandth of the way, behind the object": (1.3, 0.05),
 }
 """Where the probe leaves a ray next to nothing, and how much of the gradient may be left."""
+MISSES = {
+    "leaves rays an empty interval (hit is False)": "near",
+    "says that rays miss the hull (hit is False), and leaves their bounds as they are": "missed",
+}
+"""What the probe does, and its `place`."""
 
 
 def test_rays_are_sampled_within_their_bounds_only(sampler):
     """Pixels that show no object pull at the field wherever their rays are sampled. When the hook closes the
     bounds, nothing may be left that pulls."""
     probe = SamplerProbe()
-    method = sampler.start(hooks=[probe])
-    n = sampler.length // 2 + 1
-    sampler.run(method, 0, n)
+    pull = pull_of(train_with(sampler, probe), sampler.half)
     require(
         probe.calls > 0,
         "no step asks the hook for the rays' bounds",
         SamplerHook,
         "near, far, hit = hook.bound(origins, directions, near, far), for each hook of setup(), in train_step()",
     )
-    batch_of = choose_batches(method, DataManager(scene().train, 0))
-    # Two batches: what both have in common, such as the decay of parameters, does not come from the rays.
-    batches = [batch_of(step)._replace(mask=torch.zeros_like(batch_of(step).mask)) for step in (n, n + 1)]
-
-    def pull() -> float:
-        one, other = (gradient(method, batch, n) for batch in batches)
-        return distance(one, other)
-
     free = pull()
     require(
         free > 0,
@@ -59,6 +62,59 @@ def test_rays_are_sampled_within_their_bounds_only(sampler):
             "outside their bounds",
             SamplerHook,
             "take samples from the hook's near to its far at all levels, and give the last one no length beyond",
+        )
+
+
+def test_samples_outside_the_hull_are_dropped_where_the_setting_is_taken(sampler):
+    config = with_settings(sampler, drop_outside=True)
+    if config is None:
+        pytest.skip(f"{sampler.name} has no setting vd.drop_outside, or refuses it")
+    probe = SamplerProbe(drop_outside=True)
+    pull = pull_of(train_with(sampler, probe, config), sampler.half)
+    free = pull()
+    probe.place = "nowhere"
+    left = pull()
+    require(
+        left <= 1e-6 * free,
+        f"with vd.drop_outside the hook's keep() keeps no sample, and {left:.2g} of a gradient of {free:.2g} is "
+        "still there",
+        VisDomSampler.keep,
+        "ask keep() of each hook about each sample's point; or refuse vd.drop_outside with a ConfigError in the "
+        "config's __post_init__, as is done for configs without a field vd of their own",
+    )
+
+
+def test_the_hull_has_no_part_in_novel_views_unless_asked_for(sampler):
+    config = with_settings(sampler, hull_at_inference=False) or sampler.config
+    probe = SamplerProbe()
+    method = train_with(sampler, probe, config)
+    before = probe.calls
+    method.render(scene().test.cameras[0], torch.ones(3))
+    require(
+        probe.calls == before,
+        f"config.vd.hull_at_inference is off, and render() asks the hook for bounds {probe.calls - before} times",
+        Method.render,
+        "hooks = self.hooks if self.config.vd.hull_at_inference else []",
+    )
+
+
+def test_the_hull_at_inference_bounds_novel_views(sampler):
+    config = with_settings(sampler, hull_at_inference=True)
+    if config is None:
+        pytest.skip(f"{sampler.name} has no setting vd.hull_at_inference, or refuses it")
+    probe = SamplerProbe()
+    method = train_with(sampler, probe, config)
+    before = probe.calls
+    for words, place in MISSES.items():
+        probe.place = place
+        alpha = method.render(scene().test.cameras[0], torch.ones(3)).alpha
+        require(
+            probe.calls > before and float(alpha.max()) <= 1e-6,
+            f"config.vd.hull_at_inference is on, the hook {words}, and render() asks it {probe.calls - before} "
+            f"times and shows an opacity of up to {float(alpha.max()):.2g}",
+            SamplerConfig,
+            "bound the rays of render() by the hooks, too, and show the background where hit is False; or refuse "
+            "the setting with a ConfigError in the config's __post_init__",
         )
 
 
@@ -129,6 +185,37 @@ def test_opacity_outside_the_hull_falls(hooked):
         SamplerHook if hooked.hook == "sampler" else GaussianHook,
         "pass hooks on to where rays or Gaussians are, and let the silhouette loss have config.mask_weight",
     )
+
+
+def with_settings(subject, **settings: bool) -> Any:
+    """The config with other settings of the hook; None where it has no such setting, or refuses it."""
+    vd = subject.config.vd
+    if not all(hasattr(vd, name) for name in settings):
+        return None
+    try:
+        return replace(subject.config, vd=replace(vd, **settings))
+    except ConfigError:
+        return None
+
+
+def train_with(subject, probe: SamplerProbe, config: Any = None) -> Any:
+    """The method, half trained with a probe in the hook's place."""
+    method = subject.start(config, hooks=[probe])
+    subject.run(method, 0, subject.half)
+    return method
+
+
+def pull_of(method: Any, step: int) -> Callable[[], float]:
+    """How much pixels that show no object pull at the field, whenever it is asked: always the same pixels."""
+    batch_of = choose_batches(method, DataManager(scene().train, 0))
+    # Two batches: what both have in common, such as the decay of parameters, does not come from the rays.
+    batches = [batch_of(i)._replace(mask=torch.zeros_like(batch_of(i).mask)) for i in (step, step + 1)]
+
+    def pull() -> float:
+        one, other = (gradient(method, batch, step) for batch in batches)
+        return distance(one, other)
+
+    return pull
 
 
 def follow(subject) -> tuple[GaussianProbe, list]:

@@ -12,6 +12,10 @@ from torch import Generator, Tensor
 
 from visdom_plugin.threads import spread
 
+ROUNDING = -1e-3
+"""In cells: rays that are cut to the cube end on its faces, and rounding puts their ends up to about 1e-4 outside.
+So little below a lower face still is the first cell."""
+
 
 class PackedSamples(NamedTuple):
     """Intervals of all rays, one ray after the other."""
@@ -169,10 +173,10 @@ def _walk(r, origins, directions, near, far, step, shift, occupied, half_side, s
         middle = begin + np.float32(0.5) * step[r]
         if not middle < far[r]:
             break
-        x = int((ox + middle * dx + half_side) * scale)
-        y = int((oy + middle * dy + half_side) * scale)
-        z = int((oz + middle * dz + half_side) * scale)
-        if 0 <= x < n and 0 <= y < n and 0 <= z < n and occupied[x, y, z]:
+        x = (ox + middle * dx + half_side) * scale
+        y = (oy + middle * dy + half_side) * scale
+        z = (oz + middle * dz + half_side) * scale
+        if ROUNDING < x < n and ROUNDING < y < n and ROUNDING < z < n and occupied[int(x), int(y), int(z)]:
             if starts is not None:
                 starts[at + found] = begin
             found += 1
@@ -187,11 +191,11 @@ def _touch(origins, directions, near, far, step, touched, half_side):
     for r in range(len(origins)):
         t = near[r]
         while t < far[r]:
-            x = int((origins[r, 0] + t * directions[r, 0] + half_side) * scale)
-            y = int((origins[r, 1] + t * directions[r, 1] + half_side) * scale)
-            z = int((origins[r, 2] + t * directions[r, 2] + half_side) * scale)
-            if 0 <= x < n and 0 <= y < n and 0 <= z < n:
-                touched[x, y, z] = True
+            x = (origins[r, 0] + t * directions[r, 0] + half_side) * scale
+            y = (origins[r, 1] + t * directions[r, 1] + half_side) * scale
+            z = (origins[r, 2] + t * directions[r, 2] + half_side) * scale
+            if ROUNDING < x < n and ROUNDING < y < n and ROUNDING < z < n:
+                touched[int(x), int(y), int(z)] = True
             t += step
 
 
@@ -236,7 +240,7 @@ def select(samples: PackedSamples, kept: Tensor) -> PackedSamples:
 
 
 def _march_torch(origins, directions, near, far, step, shift, grid: OccupancyGrid) -> PackedSamples:
-    most = int(((far - near) / step).clamp_min(0).max().ceil()) + 1
+    most = int(((far - near) / step).clamp_min(0).max().ceil()) + 1 if len(origins) else 0
     index = torch.arange(most, device=origins.device)
     starts = near[:, None] + (index + shift[:, None]) * step[:, None]
     middles = starts + 0.5 * step[:, None]

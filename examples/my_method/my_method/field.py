@@ -24,18 +24,18 @@ class Field:
         values = grid_sample(self.grid, at, padding_mode="border", align_corners=True)[0, :, :, 0, 0]
         return torch.exp(20 * values[0] - 1), (10 * values[1:]).T.sigmoid()
 
-    def trace(self, origins, directions, background, hooks):
+    def trace(self, origins, directions, background, hooks, training=False):
         nearest = -(self.frame.to_local(origins) * directions).sum(-1).float()
         near, far = (nearest - self.radius).clamp_min(0), nearest + self.radius
-        o, d, near, far, _ = radiance.bound_rays(origins, directions, near, far, self.frame, hooks)
+        o, d, near, far, hit = radiance.bound_rays(origins, directions, near, far, self.frame, hooks)
         t = near[:, None] + (far - near)[:, None] * torch.linspace(0, 1, self.config.samples + 1).to(near)
         density, rgb = self.look(o[:, None] + (t[:, 1:] + t[:, :-1])[..., None] / 2 * d[:, None])
-        weights, _ = weights_from_density(density.reshape(len(t), -1), t)
+        weights = weights_from_density(density.reshape(len(t), -1), t)[0] * (hit | training)[:, None]
         return composite(weights, rgb.reshape(len(t), -1, 3), t, background)
 
     def train_step(self, batch, step):
         white = torch.ones(3, device=self.device)
-        rgb, alpha, _ = self.trace(batch.origins, batch.directions, white, self.hooks)
+        rgb, alpha, _ = self.trace(batch.origins, batch.directions, white, self.hooks, training=True)
         colour = (rgb - radiance.photograph_on(white, batch, alpha)).square().mean()
         return {"colour": colour, "mask": self.config.mask_weight * radiance.silhouette_loss(alpha, batch)}
 
