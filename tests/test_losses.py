@@ -1,8 +1,11 @@
 """Losses by their definitions."""
 
+import pytest
 import torch
 
-from visdom_plugin.losses import composite, disparity_loss, mask_loss, photometric_loss
+from visdom_plugin.hooks.regularizer import outside_loss
+from visdom_plugin.losses import below_one, composite, disparity_loss, mask_loss, photometric_loss
+from visdom_plugin.nerf.volume import weights_from_density
 from visdom_plugin.ssim import ssim
 
 
@@ -25,6 +28,45 @@ def test_mask_loss_is_cross_entropy_and_finite_at_the_ends():
     torch.testing.assert_close(mask_loss(alpha[:1], mask[:1]), 2 * expected)
     mask_loss(alpha, mask).backward()
     assert torch.isfinite(alpha.grad).all()
+
+
+def test_opacity_below_one_is_the_bound_in_value_and_the_identity_in_gradient():
+    near_one = 1 - torch.logspace(-8, -4, 200, dtype=torch.float64)
+    for dtype in (torch.float32, torch.float64):
+        alpha = torch.cat([torch.linspace(0, 1.0001, 500).double(), near_one]).to(dtype).requires_grad_()
+        bounded = below_one(alpha)
+        assert torch.equal(bounded, alpha.clamp_max(1 - 1e-6)) and (alpha > 1 - 1e-6).sum() > 20
+        bounded.sum().backward()
+        assert (alpha.grad == 1).all()
+
+
+def both_losses(alpha):
+    """Of pixels off the object and off the hull."""
+    return [mask_loss(alpha, torch.zeros_like(alpha)), outside_loss(alpha, torch.zeros_like(alpha).bool())]
+
+
+def test_the_pull_on_a_pixel_grows_with_its_opacity_up_to_one():
+    for which in (0, 1):
+        alpha = torch.tensor([0.5, 0.9999, 0.999999, 0.9999995, 1.0, 1.0000001], requires_grad=True)
+        both_losses(alpha)[which].backward()
+        assert (alpha.grad.diff() >= 0).all() and (alpha.grad > 0).all() and torch.isfinite(alpha.grad).all()
+        assert alpha.grad[-1] == pytest.approx(1e6 / 6, rel=0.02)
+
+
+@pytest.mark.parametrize("depth", [5.0, 13.0, 14.0, 20.0])
+def test_a_saturated_ray_still_loses_density(depth):
+    """The opacity of a ray of optical depth 20 is 1 in float32; its density has a gradient nevertheless."""
+    for which in (0, 1):
+        density = torch.full((1, 8), depth, requires_grad=True)
+        weights, _ = weights_from_density(density, torch.linspace(0, 1, 9)[None])
+        both_losses(weights.sum(-1))[which].backward()
+        assert (density.grad > 0).all()
+
+
+def test_inside_the_mask_the_gradient_ends_at_the_bounds():
+    alpha = torch.tensor([0.0, 1e-7, 0.5, 1.0], requires_grad=True)
+    mask_loss(alpha, torch.ones(4)).backward()
+    assert alpha.grad.tolist() == [0, 0, -0.5, 0]
 
 
 def test_disparity_loss_ignores_scale_and_shift_of_disparity():

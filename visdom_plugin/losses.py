@@ -56,6 +56,18 @@ def photometric_loss(rgb: Tensor, target: Tensor, ssim_weight: float, weight: Te
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(rgb, target)) / share
 
 
+_OPAQUE = 1 - 1e-6
+
+
+def below_one(alpha: Tensor) -> Tensor:
+    """Opacity, at most 1 - 1e-6, as losses need it that take log(1 - alpha).
+
+    The bound keeps loss and gradient finite but lets the gradient through: a pixel beyond it is pulled down as
+    one at the bound.
+    """
+    return alpha - (alpha.detach() - _OPAQUE).clamp_min(0)
+
+
 def mask_loss(alpha: Tensor, mask: Tensor, weight: Tensor | None = None) -> Tensor:
     """Mean binary cross entropy between rendered opacity and the foreground mask.
 
@@ -64,7 +76,8 @@ def mask_loss(alpha: Tensor, mask: Tensor, weight: Tensor | None = None) -> Tens
         mask: (H, W) float, 1 on the object.
         weight: (H, W) float, 0 at pixels that take no part and 1 elsewhere, or None when all do.
     """
-    alpha = alpha.clamp(1e-6, 1 - 1e-6)
+    # Inside the mask nothing is gained beyond the upper bound. The lower one stops an unbounded gradient.
+    alpha = torch.where(mask < 1, below_one(alpha), alpha.clamp_max(_OPAQUE)).clamp_min(1e-6)
     if weight is None:
         return torch.nn.functional.binary_cross_entropy(alpha, mask)
     total = torch.nn.functional.binary_cross_entropy(alpha, mask, weight, reduction="sum")

@@ -11,6 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+from datamodules.synthetic import SyntheticConfig, make_scene
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "my_method"
 
@@ -18,6 +21,22 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "my_method"
 def test_the_example_is_short():
     files = [p for p in EXAMPLE.rglob("*") if p.suffix in (".py", ".toml") and "build" not in p.parts]
     assert len(files) == 3 and sum(len(p.read_text().splitlines()) for p in files) < 80
+
+
+def test_rays_that_look_away_show_the_background(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLE)
+    from my_method import Config
+    from my_method.field import Field
+
+    views = make_scene(SyntheticConfig(size=16, train_views=3, test_views=0)).train
+    field = Field(Config(samples=4, resolution=4))
+    field.setup(views, [], hull=None, device=torch.device("cpu"), seed=0)
+    origins, towards = views.cameras.centres, views.cameras.forward
+    red = torch.tensor([1.0, 0, 0])
+    for sign, sees in ((1, True), (-1, False)):
+        rgb, alpha, _ = field.trace(origins, sign * towards, red, [])
+        assert torch.isfinite(rgb).all() and (alpha > 0).all() == sees
+        assert torch.equal(rgb, red.expand(3, 3)) != sees
 
 
 @pytest.fixture(scope="module")

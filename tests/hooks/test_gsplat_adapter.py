@@ -208,13 +208,14 @@ def test_points_of_the_companion_lie_in_the_hull_and_none_is_ended(gsplat, scene
     assert companion.step_post_backward(trainer.params, trainer.optimizers, trainer.state, 0) == 0
 
 
-def test_steps_without_loss_and_hulls_all_lie_outside_of(gsplat, scene):
+def test_steps_without_loss_and_hulls_all_lie_outside_of(gsplat, scene, caplog):
     views, hull = scene
     companion = companion_of(scene, weight=0.0)
     trainer = Trainer(gsplat, "default", views, companion, in_a_box(hull) + 100)
     arguments = (trainer.params, trainer.optimizers, trainer.state)
     assert companion.step_pre_backward(*arguments, 0) == 0
     assert companion.step_post_backward(*arguments, 0) == 0 and len(trainer.params["means"]) == N
+    assert "another frame" in caplog.text
 
 
 def test_fading_keeps_what_is_inside_and_forgets_moments(gsplat, scene):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from visdom_plugin import Hull, VisDomSampler
-from visdom_plugin.errors import PluginError
+from visdom_plugin.errors import ConfigError, PluginError
 from visdom_plugin.hooks.adapters.nerfacc import confine, ray_limits, ray_planes
 
 BOX, RESOLUTION, LEVELS = [-1.0, -1.2, -1.0, 1.0, 1.2, 1.0], [10, 12, 8], 2
@@ -70,6 +70,13 @@ def test_cells_that_stay_open_are_those_the_hull_reaches(hull, margin):
     box = estimator.aabbs[1].double().numpy()
     index = np.floor((points - box[:3]) / (box[3:] - box[:3]) * RESOLUTION).astype(int)
     assert wanted[1][tuple(index.T)].all()
+
+
+def test_a_hull_that_reaches_no_cell_is_refused_and_nothing_closed(hull):
+    estimator = estimator_like()
+    with pytest.raises(ConfigError, match="reaches no cell"):
+        confine(estimator, Hull.from_grid(hull.occupancy, hull.bounds + 1000), margin=0.1)
+    assert estimator.binaries.all() and not estimator.occs.any()
 
 
 def test_cells_outside_never_revive(nerfacc, hull):

@@ -85,7 +85,7 @@ def test_bounds_come_in_the_rays_precision_and_never_cut_into_the_band(ball, dty
 def test_no_grad_and_autocast_change_nothing(ball):
     cameras, hull, origins, directions = ball
     sampler, hook = VisDomSampler(hull), VisDomGaussianRegularizer(hull, cameras)
-    alpha = torch.rand(SIZE, SIZE)
+    alpha = torch.rand(SIZE, SIZE, requires_grad=True)
 
     def both():
         loss = hook.loss(lambda camera: alpha, generator=torch.Generator().manual_seed(3))
@@ -108,14 +108,14 @@ def test_loss_of_half_precision_is_that_of_single(dtype):
     loss = outside_loss(alpha, mask)
     loss.backward()
     assert torch.equal(loss, outside_loss(alpha.float(), mask)) and loss > 1
-    assert torch.isfinite(alpha.grad[alpha < 1]).all() and alpha.grad.dtype == dtype
+    assert torch.isfinite(alpha.grad).all() and alpha.grad.dtype == dtype
 
 
 def test_loss_takes_what_rasterisers_return_and_names_what_does_not_fit(ball):
     cameras, hull, _, _ = ball
     wide = cameras.resized(SIZE, SIZE // 2)
     hook = VisDomGaussianRegularizer(hull, wide)
-    alpha = torch.rand(SIZE // 2, SIZE)
+    alpha = torch.rand(SIZE // 2, SIZE, requires_grad=True)
     seen = []
 
     def value(shape):
@@ -180,7 +180,8 @@ class RayData(Dataset):
     def __getitem__(self, index):
         draw = torch.Generator().manual_seed(index)
         bounds = self.sampler(self.origins[index], self.directions[index], 0.1, 9.0)
-        loss = self.hook.loss(lambda camera: torch.full((SIZE, SIZE), 0.5), index, draw)
+        with torch.no_grad():
+            loss = self.hook.loss(lambda camera: torch.full((SIZE, SIZE), 0.5), index, draw)
         return *bounds, self.hook.initial_points(7, draw)[0], loss["visdom_outside"]
 
 
@@ -200,7 +201,7 @@ def test_copies_give_equal_results(ball):
     cameras, hull, origins, directions = ball
     sampler = VisDomSampler(hull, interval="first_hit", missing="skip", drop_outside=True)
     hook = VisDomGaussianRegularizer(hull, cameras, prune_every=1, bank=4)
-    alpha = torch.rand(SIZE, SIZE)
+    alpha = torch.rand(SIZE, SIZE, requires_grad=True)
     points = torch.randn(50, 3) + 1
 
     def results(sampler, hook):
@@ -252,7 +253,7 @@ hull = VisibleDomain(k=3, resolution=32).carve(cameras, masks)
 near, far, hit = VisDomSampler(hull)(np.array([3.0, 0, 0]), np.array([-1.0, 0, 0]), 0.0, 9.0)
 assert bool(hit) and 0 < float(near) < float(far) < 9
 hook = VisDomGaussianRegularizer(hull, cameras, prune_every=1)
-assert hook.loss(lambda camera: torch.full((32, 32), 0.5))["visdom_outside"] > 0
+assert hook.loss(lambda camera: torch.full((32, 32), 0.5, requires_grad=True))["visdom_outside"] > 0
 assert hook.after_step(type("Cloud", (), {{"means": torch.zeros(1, 3)}}), 0).tolist() == [False]
 """
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -87,6 +87,24 @@ def test_bounds_stay_within_the_callers(hull, rays):
         assert torch.equal(bounds.near[missed], near[missed]) and torch.equal(bounds.far[missed], far[missed])
 
 
+@pytest.mark.parametrize("interval", ["first_hit", "entry_exit"])
+@pytest.mark.parametrize("missing", ["full", "skip"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.float64])
+def test_a_far_in_front_of_near_leaves_nothing_to_sample(hull, rays, interval, missing, dtype):
+    """As box intersections give for rays that miss the box; other rays do not notice."""
+    g = torch.Generator().manual_seed(4)
+    near, far = (10 * torch.rand(500, generator=g, dtype=torch.float64).to(dtype) for _ in range(2))
+    origins, directions = (x.to(dtype) for x in rays)
+    sampler = VisDomSampler(hull, interval=interval, missing=missing)
+    got = sampler(origins, directions, near, far)
+    crossed = far < near
+    assert (got.near <= got.far).all() and 0.3 < crossed.float().mean() < 0.7
+    assert torch.equal(got.near[crossed], near[crossed]) and torch.equal(got.far[crossed], near[crossed])
+    assert not got.hit[crossed].any() and got.hit.any()
+    alone = sampler(*(x[~crossed] for x in (origins, directions, near, far)))
+    assert all(torch.equal(a[~crossed], b) for a, b in zip(got, alone, strict=True))
+
+
 def test_bounds_do_not_depend_on_the_length_of_directions(hull, rays):
     origins, directions = rays
     sampler = VisDomSampler(hull, epsilon_hull_radii=0.5)

@@ -42,7 +42,7 @@ class SamplerHook(Protocol):
 
         Args:
             origins, directions: (..., 3) world frame.
-            near, far: (...) the method's own bounds.
+            near, far: (...) the method's own bounds; where far < near there is nothing to sample.
         """
         ...
 

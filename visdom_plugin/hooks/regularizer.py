@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.cameras import Cameras, interpolate
+from visdom_plugin.cameras import Cameras, interpolate, project
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.hull import Hull
-from visdom_plugin.hull.paint import colour_points
+from visdom_plugin.hull.paint import check_images, colour_points
 from visdom_plugin.hull.raycast import depth_and_silhouette
+from visdom_plugin.losses import below_one
 from visdom_plugin.render import Render
+
+log = logging.getLogger(__name__)
 
 
 def outside_loss(alpha: Tensor, hull_mask: Tensor) -> Tensor:
@@ -30,12 +36,27 @@ def outside_loss(alpha: Tensor, hull_mask: Tensor) -> Tensor:
     """
     if alpha.dtype in (torch.float16, torch.bfloat16):
         alpha = alpha.float()  # 1 - 1e-6 would round to 1
-    # 1e-6 keeps the gradient of a fully opaque pixel finite: at most 1e6 / (H * W).
-    return torch.where(hull_mask, 0.0, -torch.log1p(-alpha.clamp(max=1 - 1e-6))).mean()
+    return torch.where(hull_mask, 0.0, -torch.log1p(-below_one(alpha))).mean()
 
 
-def _image(alpha: Tensor, shape: torch.Size) -> Tensor:
-    """Opacity without the dimensions of size one that rasterisers add."""
+def _opacity(drawn: Any, shape: torch.Size) -> Tensor:
+    """Opacity of what a renderer returned, without the dimensions of size one that rasterisers add."""
+    alpha = getattr(drawn, "alpha", drawn)
+    if not isinstance(alpha, Tensor):
+        raise ConfigError(
+            f"render(camera) returned {type(drawn).__name__}, which is no opacity",
+            where="VisDomGaussianRegularizer.loss",
+            cause="a renderer that returns several things: gsplat's returns colours, opacity, info",
+            todo="return the opacity tensor alone, or an object that has it as .alpha",
+        )
+    # An empty picture may be a constant.
+    if torch.is_grad_enabled() and not alpha.requires_grad and bool((alpha > 0).any()):
+        raise ConfigError(
+            "the rendered opacity has no gradient, so the loss would change nothing",
+            where="VisDomGaussianRegularizer.loss",
+            cause="a render under torch.no_grad(), a detached opacity, or Gaussians that are not trained",
+            todo="render with gradients; to look at the loss alone, call it under torch.no_grad(), too",
+        )
     kept = [d for d in alpha.shape if d != 1]
     if kept != [d for d in shape if d != 1]:
         raise ConfigError(
@@ -45,6 +66,21 @@ def _image(alpha: Tensor, shape: torch.Size) -> Tensor:
             todo="return opacity (H, W) of the size that camera.height and camera.width say",
         )
     return alpha if alpha.shape == shape else alpha.reshape(shape)
+
+
+def _check_frame(hull: Hull, cameras: Cameras) -> None:
+    """Whether points in the hull fall into a picture at all."""
+    points = hull.sample_inside(4096, torch.Generator().manual_seed(0))
+    uv, depth = project(cameras, points)
+    size = torch.stack([cameras.width, cameras.height], -1)[:, None]
+    if not ((depth > 0) & (uv >= 0).all(-1) & (uv < size).all(-1)).any():
+        low, high = np.round(hull.extent, 3).tolist()
+        raise ConfigError(
+            f"no training camera sees the hull, which reaches from {low} to {high}",
+            where="VisDomGaussianRegularizer",
+            cause="a hull in another frame than the cameras': one of the two was moved, scaled or turned",
+            todo="carve from the poses that the trainer trains with",
+        )
 
 
 # As torch.compiler.disable, but the compiler is imported at the first call, not with this module.
@@ -63,7 +99,8 @@ class VisDomGaussianRegularizer:
     Args:
         hull: the visible domain; fixed from here on.
         cameras: (N,) training cameras, N >= 2; their interpolation gives the views of L_i.
-        images: N images (H, W, 3) uint8 or float in [0, 1] that colour the initial points; grey without.
+        images: N tensors or arrays (H, W, 3) of the cameras' sizes, integers in 0..255 or floats in [0, 1], that
+            colour the initial points; grey without.
         weight: lambda_3, the weight of L_i; the paper uses 0.01.
         every, start: L_i is added on steps start, start + every, ...
         views_per_step: interpolated views per loss.
@@ -74,7 +111,8 @@ class VisDomGaussianRegularizer:
         prune_margin_voxels: how far outside the hull a centre may lie, in voxels.
 
     Raises:
-        ConfigError: for fewer than two cameras or a setting out of range.
+        ConfigError: for fewer than two cameras, a setting out of range, images that do not fit the cameras, or a
+            hull that no camera sees.
     """
 
     def __init__(
@@ -82,7 +120,7 @@ class VisDomGaussianRegularizer:
         hull: Hull,
         cameras: Cameras,
         *,
-        images: Sequence[Tensor] | None = None,
+        images: Sequence[Tensor | np.ndarray] | None = None,
         weight: float = 0.01,
         every: int = 1,
         start: int = 0,
@@ -97,19 +135,32 @@ class VisDomGaussianRegularizer:
                 "VisDomGaussianRegularizer needs at least two training cameras to interpolate between",
                 todo="pass the batch of all training cameras",
             )
-        if weight < 0 or every < 1 or views_per_step < 1 or bank < 0 or points not in ("surface", "volume"):
+        if not (
+            0 <= weight < math.inf
+            and every >= 1
+            and views_per_step >= 1
+            and bank >= 0
+            and points in ("surface", "volume")
+            and prune_every >= 0
+            and 0 <= prune_margin_voxels < math.inf
+        ):
             raise ConfigError(
                 f"weight={weight}, every={every}, views_per_step={views_per_step}, bank={bank}, "
-                f"points={points!r}: weight and bank must be >= 0, every and views_per_step >= 1, "
-                "points 'surface' or 'volume'"
+                f"points={points!r}, prune_every={prune_every}, prune_margin_voxels={prune_margin_voxels}: "
+                "weight, bank, prune_every and prune_margin_voxels must be >= 0, every and views_per_step >= 1, "
+                "points 'surface' or 'volume'",
+                where="VisDomGaussianRegularizer",
             )
-        self.hull, self.cameras, self.images = hull, cameras.to("cpu"), images
+        self.hull, self.cameras = hull, cameras.to("cpu")
+        _check_frame(hull, self.cameras)
+        self.images = None if images is None else check_images(images, self.cameras)
         self._device = cameras.width.device
         self.weight, self.every, self.start, self.views_per_step = weight, every, start, views_per_step
         self.bank, self._bank = bank, {}
         self.points, self.prune_every = points, prune_every
         self.prune_margin_voxels = prune_margin_voxels
         self._look_at = torch.as_tensor(hull.centre).to(self.cameras.world_from_camera)
+        self._warned = False
 
     def initial_points(self, n: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
         """Points to start from: xyz (n, 3) float32 world frame and rgb (n, 3) float32 in [0, 1], on the device
@@ -129,7 +180,10 @@ class VisDomGaussianRegularizer:
         return interpolate(self.cameras[first], self.cameras[second], t, self._look_at)
 
     def loss(
-        self, render: Callable[[Cameras], Render], step: int = 0, generator: Generator | None = None
+        self,
+        render: Callable[[Cameras], Render | Tensor],
+        step: int | None = None,
+        generator: Generator | None = None,
     ) -> dict[str, Tensor]:
         """Weighted L_i of this step, {"visdom_outside": scalar}, or {} on steps without it.
 
@@ -137,21 +191,33 @@ class VisDomGaussianRegularizer:
             render: draws the current Gaussians from one camera, which is on the device and in the dtype of the
                 training cameras; returns opacity (H, W), (H, W, 1) or (1, H, W, 1), or an object that has it as
                 `.alpha`.
-            step: the trainer's step; only the schedule (`every`, `start`) reads it.
+            step: the trainer's step; only the schedule (`every`, `start`) reads it, and needs it.
             generator: CPU generator that draws the views; the default is torch's global one.
 
         Raises:
-            ConfigError: when the opacity is not of the camera's size.
+            ConfigError: without a step when `every` or `start` is set; when `render` returns no opacity of the
+                camera's size, or, while gradients are on, one without.
         """
-        if self.weight == 0 or step < self.start or (step - self.start) % self.every:
+        if not self._is_due(step):
             return {}
         total = 0.0
         for _ in range(self.views_per_step):
             camera, mask = self._draw(generator)
             drawn = render(camera.to(self._device))
-            alpha = _image(getattr(drawn, "alpha", drawn), mask.shape)
+            alpha = _opacity(drawn, mask.shape)
             total = total + outside_loss(alpha, mask.to(alpha.device))
         return {"visdom_outside": self.weight / self.views_per_step * total}
+
+    def _is_due(self, step: int | None) -> bool:
+        if step is None:
+            if self.every > 1 or self.start > 0:
+                raise ConfigError(
+                    f"every={self.every} and start={self.start} need the trainer's step",
+                    where="VisDomGaussianRegularizer.loss",
+                    todo="call hook.loss(render, step)",
+                )
+            step = self.start
+        return self.weight > 0 and step >= self.start and (step - self.start) % self.every == 0
 
     @_outside_graphs
     def _draw(self, generator: Generator | None) -> tuple[Cameras, Tensor]:
@@ -166,7 +232,14 @@ class VisDomGaussianRegularizer:
         return self._bank[index]
 
     def after_step(self, gaussians: Any, step: int) -> Tensor | None:
-        """(N,) bool, True for Gaussians the trainer should remove, or None when there is nothing to do."""
+        """(N,) bool, True for Gaussians the trainer should remove, or None when there is nothing to do.
+
+        Warns once when they are all outside, which trainers take for no reason to remove them.
+        """
         if not self.prune_every or step % self.prune_every:
             return None
-        return ~self.hull.contains(gaussians.means.detach(), margin_voxels=self.prune_margin_voxels)
+        outside = ~self.hull.contains(gaussians.means.detach(), margin_voxels=self.prune_margin_voxels)
+        if len(outside) and not self._warned and bool(outside.all()):
+            self._warned = True
+            log.warning("all %d Gaussians lie outside the hull: is it in another frame?", len(outside))
+        return outside

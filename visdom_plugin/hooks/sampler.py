@@ -43,7 +43,8 @@ class VisDomSampler:
         first_hit:  [t_first - epsilon, t_first + epsilon]   (the paper's)
         entry_exit: [t_first - epsilon, t_last + epsilon]
 
-    cut to the caller's [near, far].
+    cut to the caller's [near, far]. That is for the rays of training, beside a mask loss (`losses.mask_loss`, with
+    the paper's weight 0.1); novel views are drawn over the full range.
 
     Args:
         hull: the visible domain; fixed from here on.
@@ -108,7 +109,8 @@ class VisDomSampler:
         Args:
             origins, directions: (..., 3) tensors or arrays, world frame, broadcast against each other; directions
                 of any length but zero.
-            near, far: (...) tensors or numbers, in units of the direction's length.
+            near, far: (...) tensors or numbers, in units of the direction's length. Where far < near, as of a ray
+                that misses the caller's box, far is taken to be near.
 
         Returns:
             RayBounds of shape (...), in the directions' dtype, on their device; near <= far everywhere. In half
@@ -132,6 +134,7 @@ class VisDomSampler:
             crossing = cast(self.hull, origins, directions)
             first = crossing.t_first
             near, far = (_limit(x, first) for x in (near, far))
+            far = torch.maximum(far, near)
             last = first if self.interval == "first_hit" else crossing.t_last
             epsilon = self.epsilon_world / directions.norm(dim=-1).to(first)
             begin, end = torch.maximum(near, first - epsilon), torch.minimum(far, last + epsilon)

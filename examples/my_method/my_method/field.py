@@ -26,7 +26,7 @@ class Field:
 
     def trace(self, origins, directions, background, hooks, training=False):
         nearest = -(self.frame.to_local(origins) * directions).sum(-1).float()
-        near, far = (nearest - self.radius).clamp_min(0), nearest + self.radius
+        near, far = (nearest - self.radius).clamp_min(0), (nearest + self.radius).clamp_min(0)
         o, d, near, far, hit = radiance.bound_rays(origins, directions, near, far, self.frame, hooks)
         t = near[:, None] + (far - near)[:, None] * torch.linspace(0, 1, self.config.samples + 1).to(near)
         density, rgb = self.look(o[:, None] + (t[:, 1:] + t[:, :-1])[..., None] / 2 * d[:, None])

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from visdom_plugin.errors import PluginError
+from visdom_plugin.errors import ConfigError, PluginError
 from visdom_plugin.hooks.protocols import SamplerHook
 from visdom_plugin.hull.hull import Hull
 
@@ -58,6 +58,7 @@ def confine(estimator: Any, hull: Hull, *, margin: float = 0.0) -> int:
         How many cells stay open.
 
     Raises:
+        ConfigError: when no cell stays open; the estimator is left as it was.
         PluginError: for nerfacc before 0.5.3, whose updates look at closed cells, too.
     """
     package = type(estimator).__module__.partition(".")[0]
@@ -86,6 +87,14 @@ def confine(estimator: Any, hull: Hull, *, margin: float = 0.0) -> int:
             for k in (0, 1)
         )
         reached.append(inside > 0)
+    if not np.any(reached):
+        low, high = np.round(hull.extent, 3).tolist()
+        raise ConfigError(
+            f"the hull, from {low} to {high}, reaches no cell of the estimator",
+            where=f"aabbs {estimator.aabbs.tolist()}",
+            cause="a hull in another frame than the estimator's, or an empty one",
+            todo="carve from the poses that the trainer trains with, or choose the estimator's box by hull.extent",
+        )
     closed = torch.from_numpy(~np.stack(reached)).to(estimator.occs.device)
     estimator.occs[closed.flatten()] = -1.0
     estimator.binaries &= ~closed
