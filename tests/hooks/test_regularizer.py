@@ -217,6 +217,7 @@ def test_what_is_no_opacity_with_a_gradient_is_named(ball, returned, named):
         hook.loss(lambda camera: returned(alpha))
     with torch.no_grad():
         assert hook.loss(lambda camera: alpha.detach())["visdom_outside"] > 0
+    assert hook.loss(lambda camera: torch.zeros(SIZE, SIZE))["visdom_outside"] == 0
 
 
 def test_removal_is_asked_for_outside_the_margin_only(ball):
