@@ -54,7 +54,9 @@ def _render(argv: Sequence[str]) -> None:
     from visdom_plugin.training.evaluate import render_on_white
     from visdom_plugin.training.pictures import to_bytes, write_png, write_video
 
-    _, _, scene, method, hull, device, _ = open_run(options.run, options.data, options.device)
+    _, _, scene, method, hull, device, _ = open_run(
+        options.run, options.data, options.device, test=options.path == "test"
+    )
     cameras = choose_cameras(options.path, options.frames, scene, hull)
     target = options.out or options.run / "renders" / (
         f"{options.path}.mp4" if options.format == "mp4" else options.path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,8 @@ def evaluate(
         reference_hull: the default visible domain of the training views, for `outside_hull_mass`; None
             leaves that metric undefined.
         device: where the method renders.
-        folder: `<folder>/test/<name>.png` and `<folder>/test_sheet.png` are written.
+        folder: `<folder>/test/<name>.png` and `<folder>/test_sheet.png` are written; other pictures in
+            `<folder>/test` are removed.
 
     Returns:
         {"test": means, "per_view": {name: metrics}, "protocol": metrics.PROTOCOL}; see `metrics.compare`.
@@ -61,10 +63,19 @@ def evaluate(
                 truth = to_bytes(truth if ignore is None else truth.masked_fill(ignore[..., None], 0.5))
                 grey = to_bytes(alpha[..., None].expand(-1, -1, 3))
                 columns.append((f"{name}  {rows[name]['psnr']:.1f} dB", [truth, to_bytes(rgb), grey]))
-    if folder is not None and columns:
-        write_png(folder / "test_sheet.png", draw_sheet(columns, SHEET_ROWS))
+    if folder is not None:
+        _remove_others(folder / "test", files)
+        if columns:
+            write_png(folder / "test_sheet.png", draw_sheet(columns, SHEET_ROWS))
     means = metrics.mean_over_views(list(rows.values()))
     return {"test": means, "per_view": rows, "protocol": dict(metrics.PROTOCOL)}
+
+
+def _remove_others(folder: Path, names: Sequence[str]) -> None:
+    """Removes pictures that an evaluation of other views left behind."""
+    for path in folder.glob("*.png"):
+        if path.stem not in names:
+            path.unlink()
 
 
 def render_on_white(method: Method, camera: Cameras, device: torch.device) -> tuple[Tensor, Tensor]:
