@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,6 +86,34 @@ def test_the_views_of_a_run_stay_whatever_its_lists_say_now(listed, capsys, now)
     assert read(listed)["metrics"] == before["metrics"] and read(listed)["data"] == before["data"]
     assert list(before["metrics"]["per_view"]) == before["data"]["test"] == ["v0.png", "v2.png"]
     assert frames("test", listed) == 0 and len(list(Path("of_test").iterdir())) == 2
+
+
+def test_an_interrupted_run_goes_on_where_its_scene_was_renamed_and_its_lists_are_gone(
+    folder, listed, capsys, monkeypatch
+):
+    whole = read(listed)
+    lists = ["--train-list", "train.txt", "--test-list", "test.txt"]
+    step_of = fake.FakeMethod.train_step
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            fake.FakeMethod,
+            "train_step",
+            lambda self, batch, step: (
+                (step == 3 and signal.raise_signal(signal.SIGINT)) or step_of(self, batch, step)
+            ),
+        )
+        assert train.main([*TRAIN, "--data", str(folder), "--out", "cut", *lists]) == 130
+    folder.rename("renamed")
+    Path("train.txt").unlink()
+    lists = ["--train-list", "1,3,5,6", "--test-list", "v0,v2"]
+    words = [word for word in TRAIN if word != "--quiet"]
+    assert train.main([*words, "--data", "renamed", "--out", "cut", *lists]) == 0
+    assert "resumed after step 4" in capsys.readouterr().err
+    assert read(Path("cut"))["metrics"] == whole["metrics"] and read(Path("cut"))["scene"] == "renamed"
+    assert evaluate.main(["cut", "--quiet"]) == 0
+    # The comparison can fail.
+    assert train.main([*TRAIN, "--data", "renamed", "--out", "cut", *lists[:3], "v0"]) == 2
+    assert "data.test" in capsys.readouterr().err
 
 
 def test_a_single_view_and_names_with_commas(folder, capsys):

@@ -164,9 +164,12 @@ def test_a_directory_of_another_run_is_refused_and_stays_as_it_is(train, tmp_pat
     assert record["status"] == "finished" and not record["already_finished"]
 
 
-def test_moved_data_is_the_same_data(train):
+def test_moved_data_is_the_same_data(train, scene):
     train(request={"path": "/somewhere"})
     assert train(request={"path": "/elsewhere"})["already_finished"]
+    source = scene.source | {"root": "renamed", "split": "by hand"}
+    renamed = replace(scene, name="renamed", source=source)
+    assert train(scene=renamed, request={"train_list": "/gone.txt"})["already_finished"]
 
 
 def test_a_folder_that_is_no_run_is_never_touched(train, tmp_path):

@@ -26,7 +26,10 @@ from visdom_plugin.training.settings import as_plain, differences
 
 SCHEMA = 1
 IDENTITY = ("method", "scene", "seed", "config", "data")
-"""Fields of run.json that must agree for a run to be resumed."""
+"""Fields of run.json that say which run it is."""
+_WHEREABOUTS = ("path", "root", "split", "train_list", "test_list")
+"""What `data` says of where the data lies and how its views were chosen. That may change, as may the scene's name;
+what must agree for a run to be resumed are the views' names, the hashes, and the other fields of `IDENTITY`."""
 _OURS = ("log.jsonl", "checkpoints", "hull", "renders", "export", "run.json")
 _LOCK = "run.lock"
 
@@ -240,21 +243,23 @@ class RunDir:
                 target.unlink(missing_ok=True)
 
     def _refuse_other(self, identity: dict[str, Any]) -> None:
-        there = {name: self.record.get(name) for name in IDENTITY}
-        # Where the data lies may change; what it is may not.
-        for record in (there, identity := dict(identity)):
-            data = record.get("data")
-            record["data"] = (
-                {k: v for k, v in data.items() if k != "path"} if isinstance(data, dict) else data
-            )
-        lines = differences(there, identity)
-        if lines:
+        if differences(_decisive(self.record), _decisive(identity)):
+            there, now = ({name: record.get(name) for name in IDENTITY} for record in (self.record, identity))
+            lines = differences(there, now)
             more = f"\n    and {len(lines) - 8} more" if len(lines) > 8 else ""
             raise CheckpointError(
                 "the run directory holds another run (there -> now):\n    " + "\n    ".join(lines[:8]) + more,
                 where=self.path,
                 todo="choose another directory with --out, or replace what is there with --overwrite",
             )
+
+
+def _decisive(record: dict[str, Any]) -> dict[str, Any]:
+    """What must agree in two records of one run."""
+    data = record.get("data")
+    if isinstance(data, dict):
+        data = {name: value for name, value in data.items() if name not in _WHEREABOUTS}
+    return {name: record.get(name) for name in IDENTITY if name != "scene"} | {"data": data}
 
 
 def read_record(path: Path) -> dict[str, Any]:
