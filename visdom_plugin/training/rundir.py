@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import shutil
 from contextlib import suppress
@@ -23,6 +24,8 @@ from visdom_plugin.scene import Scene, Views
 from visdom_plugin.training.checkpoints import list_steps
 from visdom_plugin.training.files import MARK, remove_parts, write_bytes, write_json
 from visdom_plugin.training.settings import as_plain, differences
+
+log = logging.getLogger(__name__)
 
 SCHEMA = 1
 IDENTITY = ("method", "scene", "seed", "config", "data")
@@ -107,7 +110,7 @@ class RunDir:
 
         Args:
             identity: the fields `IDENTITY`.
-            overwrite: throw away the run that is there, whatever it is.
+            overwrite: throw away the run that is there, unless it is the same one and was cut short.
 
         Raises:
             CheckpointError: when the directory holds another run or foreign files, or when another process
@@ -136,7 +139,7 @@ class RunDir:
             remove_parts(run.path)
             run._is_new = not (run.path / "run.json").exists()
             if not run._is_new:
-                if overwrite:
+                if overwrite and not run._goes_on(identity):
                     run._clear()
                 else:
                     run.record = read_record(run.path)
@@ -241,6 +244,18 @@ class RunDir:
                 shutil.rmtree(target)
             else:
                 target.unlink(missing_ok=True)
+
+    def _goes_on(self, identity: dict[str, Any]) -> bool:
+        """Whether the directory holds this very run, interrupted or killed."""
+        try:
+            record = read_record(self.path)
+        except CheckpointError:
+            return False
+        same = not differences(_decisive(record), _decisive(identity))
+        if not same or record.get("status") not in ("interrupted", "running"):
+            return False
+        log.info("the run directory holds this run, cut short: it goes on (--overwrite is for other runs)")
+        return True
 
     def _refuse_other(self, identity: dict[str, Any]) -> None:
         if differences(_decisive(self.record), _decisive(identity)):
