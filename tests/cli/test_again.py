@@ -11,11 +11,17 @@ from pathlib import Path
 import cv2
 import pytest
 
+from datamodules import load
+from tests.datamodules import test_layouts as layouts
 from tests.datamodules.layout_writers import write_colmap
 from tests.training import fake
 from visdom_plugin import registry
-from visdom_plugin.cli import evaluate, render, train
+from visdom_plugin.cli import evaluate, render, scenes, train
+from visdom_plugin.errors import CheckpointError
+from visdom_plugin.scene import hold_out
+from visdom_plugin.training.rundir import describe_data
 
+free, plain = layouts.free, layouts.plain
 TRAIN = ["method:fake", "--method.steps", "6", "--quiet"]
 
 
@@ -114,6 +120,26 @@ def test_an_interrupted_run_goes_on_where_its_scene_was_renamed_and_its_lists_ar
     # The comparison can fail.
     assert train.main([*TRAIN, "--data", "renamed", "--out", "cut", *lists[:3], "v0"]) == 2
     assert "data.test" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", layouts.LAYOUTS)
+@pytest.mark.parametrize("held_out", [False, True])
+def test_every_layout_gives_the_noted_views_again(name, held_out, free, plain, tmp_path):
+    """Whatever chose the views; `load_again` compares the hashes itself."""
+    _, which, writer, below = layouts.LAYOUTS[name]
+    path = writer(free if which == "free" else plain, tmp_path / "thing") / below
+    asked = {"views": 5, "downscale": 1.5, "seed": 0}
+    scene = load(path, **asked, hold_out=not held_out)
+    if held_out:
+        scene = hold_out(scene, 2)
+    noted = describe_data(scene, {"path": str(path), **asked})
+    again = scenes.load_again({"data": json.loads(json.dumps(noted))}, tmp_path, None)
+    for part in ("train", "test"):
+        assert list(getattr(again, part).names) == noted[part] and (noted[part] or part == "test")
+    if noted["test"]:
+        noted["test"] = noted["test"][1:] or [noted["train"].pop()]
+        with pytest.raises(CheckpointError, match="is not the one this run was"):
+            scenes.load_again({"data": noted}, tmp_path, None)
 
 
 def test_a_single_view_and_names_with_commas(folder, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,10 +95,13 @@ def _open_noted(path: Path | None, noted: dict[str, Any], run: Path, test: bool)
     from visdom_plugin.training.missing_masks import fill_masks
 
     asked = {name: noted[name] for name in READING if name in noted}
+    # What was held out is read as it was then, as a training view.
+    held = [noted["held_out"]] if "held_out" in noted else []
     if path is not None:
-        asked |= _list_noted(noted)
+        asked |= _list_views([*noted["train"], *held], [] if held else noted["test"])
     try:
-        scene = open_scene(path, **asked, fill=False, test=test and bool(noted["test"]))
+        looked_at = test and bool(noted["test"]) and not held
+        scene = open_scene(path, **asked, fill=False, test=looked_at, hold_out=not held)
     except ConfigError as error:
         raise CheckpointError(
             f"the scene at {path} does not have the views of this run",
@@ -105,20 +109,19 @@ def _open_noted(path: Path | None, noted: dict[str, Any], run: Path, test: bool)
             cause=error.what,
             todo="pass the right folder with --data DIR",
         ) from error
-    # The built-in scene takes no lists: what was held out of it still trains.
-    if noted.get("held_out") in scene.train.names:
-        scene = hold_out(scene, scene.train.names.index(noted["held_out"]))
+    if held and held[0] in scene.train.names:
+        scene = hold_out(scene, scene.train.names.index(held[0]))
     return fill_masks(scene, asked.get("missing_masks", "error"))
 
 
-def _list_noted(noted: dict[str, Any]) -> dict[str, Any]:
-    """Options on reading that ask for the views of a run by name."""
-    if any("," in name for name in (*noted["train"], *noted["test"])):
+def _list_views(train: Sequence[str], test: Sequence[str]) -> dict[str, Any]:
+    """Options on reading that ask for views by name."""
+    if any("," in name for name in (*train, *test)):
         # Such names cannot be listed; the lists of then are asked, and the hashes tell.
         return {}
     # A comma after the last name, so that a single one is not taken for the name of a list.
-    train, test = ("".join(f"{name}," for name in noted[part]) or None for part in ("train", "test"))
-    return {"views": len(noted["train"]), "train_list": train, "test_list": test}
+    train_list, test_list = ("".join(f"{name}," for name in names) or None for names in (train, test))
+    return {"views": len(train), "train_list": train_list, "test_list": test_list}
 
 
 def open_run(run: Path, data: Path | None, device_name: str, *, test: bool = True):
