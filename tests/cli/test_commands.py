@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import pytest
 
 from tests.training import fake
+from visdom_plugin.cameras import Cameras
 from visdom_plugin.cli import errors, evaluate, methods, render, scenes, train
+from visdom_plugin.scene import Views
+from visdom_plugin.training.rundir import hash_views
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAIN = ["method:fake", "--method.steps", "12", "--out", "run"]
@@ -123,6 +127,59 @@ def test_render_writes_pictures_of_every_path(trained, path, count):
     words = ["--path", path, "--frames", "5", "--format", "png", "--out", "frames", "--quiet"]
     assert render.main([str(trained), *words]) == 0
     assert sorted(p.name for p in Path("frames").iterdir()) == [f"{i:04d}.png" for i in range(count)]
+
+
+def _frames(run, count, *words):
+    return render.main([str(run), "--frames", str(count), "--format", "png", "--quiet", *words])
+
+
+def test_pictures_of_a_longer_path_do_not_stay(trained, capsys):
+    folder = trained / "renders" / "orbit_frames"
+    assert _frames(trained, 5) == 0
+    (folder / "0004.txt").write_text("mine")
+    assert _frames(trained, 2) == 0
+    assert sorted(p.name for p in folder.iterdir()) == ["0000.png", "0001.png", "0004.txt"]
+    # In a folder that somebody chose they may be somebody's.
+    assert _frames(trained, 3, "--out", "mine") == _frames(trained, 3, "--out", "mine") == 0
+    before = {p: p.read_bytes() for p in Path("mine").iterdir()}
+    assert _frames(trained, 2, "--out", "mine", "--path", "between") == 2
+    assert "beyond the 2 of this path: 0002.png" in capsys.readouterr().err
+    assert before == {p: p.read_bytes() for p in Path("mine").iterdir()} and len(before) == 3
+
+
+def test_pictures_of_test_views_leave_those_of_the_evaluation_alone(trained):
+    evaluated = {p.name: p.read_bytes() for p in (trained / "renders" / "test").iterdir()}
+    assert _frames(trained, 2, "--path", "test") == 0
+    assert evaluated == {p.name: p.read_bytes() for p in (trained / "renders" / "test").iterdir()}
+    assert len(list((trained / "renders" / "test_frames").iterdir())) == len(evaluated) == 3
+
+
+def test_what_cannot_be_rendered_is_said_before_anything_is(trained, capsys, monkeypatch):
+    import datamodules
+    from visdom_plugin.training import evaluate as evaluation
+
+    scene = fake.tiny_scene()
+    empty = replace(scene, test=scene.test.take([]))
+    wide = fake.tiny_views(1, 30, "wide_", (30, 20))
+    both = [[*getattr(scene.test, name), *getattr(wide, name)] for name in ("images", "masks", "names")]
+    cameras = Cameras.stack([*(scene.test.cameras[i] for i in range(3)), wide.cameras[0]])
+    mixed = replace(scene, test=Views(cameras, *both))
+    monkeypatch.setattr(evaluation, "render_on_white", None)
+
+    def fails(words, says):
+        assert render.main([str(trained), *words]) == 2
+        err = capsys.readouterr().err
+        assert says in err and "what to do" in err and "Traceback" not in err
+
+    for name in ("video", "video.gif", "folder/", "."):
+        fails(["--out", name], "ends in .mp4")
+    record = json.loads((trained / "run.json").read_text())
+    for changed, says in ((empty, "the run has no test views"), (mixed, "differ in size")):
+        monkeypatch.setattr(datamodules, "load", lambda *a, scene=changed, **k: scene)
+        record["data"]["hashes"]["test_views"] = hash_views(changed.test)
+        (trained / "run.json").write_text(json.dumps(record))
+        fails(["--path", "test"], says)
+    assert not (trained / "renders" / "test.mp4").exists()
 
 
 def test_the_path_between_views_begins_and_ends_at_views():

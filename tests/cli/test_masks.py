@@ -137,6 +137,32 @@ def test_training_says_what_it_does_without_a_mask_and_remembers_it(bare_fakes, 
     assert "missing_masks" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("without", "title"), [({1}, "2 of 3 test views"), ({0, 1, 2}, "0 of 3 test views")])
+def test_how_many_test_views_were_measured_is_said_and_noted(
+    fakes, monkeypatch, capsys, caplog, without, title
+):
+    import datamodules
+
+    whole = fake.tiny_scene()
+    gap = replace(whole, test=strip(whole.test, without))
+    monkeypatch.setattr(datamodules, "load", lambda path, **keywords: gap, raising=False)
+    command = ["method:fake", "--method.steps", "6", "--out", "run", "--data.missing-masks", "hull"]
+    for run in (lambda: train.main(command), lambda: evaluate.main(["run"])):
+        caplog.clear()
+        assert run() == 0
+        out = capsys.readouterr().out
+        assert (
+            f"fake on ball, {title}" in out and f"{len(without)} of 3 test views have no mask" in caplog.text
+        )
+        assert ("no test view has a mask of its own" in out) == (len(without) == 3) == ("PSNR" not in out)
+        found = json.loads(Path("run/run.json").read_text())["metrics"]
+        assert found["measured_views"] == 3 - len(without)
+        assert (found["test"]["psnr"] is None) == (len(without) == 3)
+        origins = [row.get("mask_origin") for row in found["per_view"].values()]
+        assert origins == ["missing" if i in without else None for i in range(3)]
+        assert len(list(Path("run/renders/test").iterdir())) == 3
+
+
 def test_the_options_of_a_file_and_of_the_command_line_agree(fakes, capsys):
     assert (
         train.main(

@@ -1,5 +1,6 @@
 """Views without a mask: what stands in for it, and that it teaches nothing wrong."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -12,9 +13,11 @@ from visdom_plugin.errors import SceneError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.raycast import depth_and_silhouette
 from visdom_plugin.methods.gs_go import GsGo
+from visdom_plugin.render import Render
 from visdom_plugin.scene import Scene, Views
 from visdom_plugin.training.evaluate import evaluate
-from visdom_plugin.training.missing_masks import fill_masks
+from visdom_plugin.training.metrics import NAMES, PROTOCOL
+from visdom_plugin.training.missing_masks import fill_masks, outline_views
 from visdom_plugin.training.rundir import hash_views
 
 DOMAIN = VisibleDomain(resolution=48)
@@ -74,9 +77,8 @@ def test_the_outline_of_the_others_hull_stands_in_and_does_not_carve(whole, bare
     assert [filled.train.mask_origin(i) for i in range(5)] == ["given"] * 4 + [way]
     again = DOMAIN.carve(*filled.train.silhouettes())
     assert (again.occupancy == others.occupancy).all() and (again.bounds == others.bounds).all()
-    _, seen = depth_and_silhouette(others, whole.test.cameras[1])
-    assert torch.equal(filled.test.masks[1], seen) and filled.test.mask_origin(1) == "hull"
-    assert filled.test.masks[0] is whole.test.masks[0] and len(filled.test.masks[:]) == 4
+    assert filled.train.masks[0] is whole.train.masks[0] and len(filled.train.masks[:]) == 5
+    assert filled.test is bare.test
     if way == "colour":
         assert torch.equal(filled.train.ignored(4), ~outline) and filled.train.ignored(0) is None
     else:
@@ -90,6 +92,50 @@ def test_what_was_ignored_stays_ignored(bare, others):
     known = replace(bare, train=replace(bare.train, ignore=(ignore, None, None, None, ignore)))
     filled = fill_masks(known, "colour", DOMAIN)
     assert filled.train.ignored(4)[:, 20:24].all() and torch.equal(filled.train.ignored(0), ignore)
+
+
+class Outline:
+    """Draws the hull's outline, or the true silhouettes, in the true colours."""
+
+    def __init__(self, views, masks):
+        self._views, self._masks = views, masks
+
+    def render(self, camera, background):
+        same = (self._views.cameras.world_from_camera == camera.world_from_camera).flatten(1).all(1)
+        i = int(same.nonzero())
+        alpha = self._masks[i].float()
+        rgb = torch.where(self._masks[i][..., None], self._views.images[i] / 255, background)
+        return Render(rgb, alpha, alpha)
+
+
+@pytest.mark.parametrize("way", ["hull", "colour"])
+def test_a_test_view_without_a_mask_is_rendered_and_not_measured(whole, bare, others, way, tmp_path, caplog):
+    """The means are those of the other views, and nobody is praised for filling the hull."""
+    test = fill_masks(bare, way, DOMAIN).test
+    assert "1 of 4 test views have no mask" in caplog.text and "test_001" in caplog.text
+    outlines = outline_views(others, whole.test, range(4))
+    for masks in (whole.test.masks, outlines):
+        method = Outline(whole.test, masks)
+        keywords = {"reference_hull": others, "device": CPU}
+        found = evaluate(method, test, folder=tmp_path, **keywords)
+        wanted = evaluate(method, choose(whole.test, [0, 2, 3]), **keywords)
+        assert found["measured_views"] == wanted["measured_views"] == 3 and found["protocol"] == PROTOCOL
+        assert repr(found["test"]) == repr(wanted["test"])
+        left_out = found["per_view"].pop("test_001")
+        assert repr(found["per_view"]) == repr(wanted["per_view"])
+        assert left_out.pop("mask_origin") == "missing" and list(left_out) == list(NAMES)
+        assert all(math.isnan(value) for value in left_out.values())
+        assert (tmp_path / "test" / "test_001.png").exists() and (tmp_path / "test_sheet.png").exists()
+
+
+def test_masks_that_only_test_views_lack_need_no_hull(whole):
+    gap = replace(whole, test=strip(whole.test, {0, 1, 2, 3}))
+    with pytest.raises(SceneError, match="4 views have no mask"):
+        fill_masks(gap, "error")
+    one = replace(gap, train=choose(gap.train, [0]))
+    assert fill_masks(one, "colour") is one
+    found = evaluate(Outline(gap.test, gap.test.masks), gap.test, reference_hull=None, device=CPU)
+    assert found["measured_views"] == 0 and all(map(math.isnan, found["test"].values()))
 
 
 def train(scene, hull, steps):

@@ -164,9 +164,12 @@ def test_a_directory_of_another_run_is_refused_and_stays_as_it_is(train, tmp_pat
     assert record["status"] == "finished" and not record["already_finished"]
 
 
-def test_moved_data_is_the_same_data(train):
+def test_moved_data_is_the_same_data(train, scene):
     train(request={"path": "/somewhere"})
     assert train(request={"path": "/elsewhere"})["already_finished"]
+    source = scene.source | {"root": "renamed", "split": "by hand"}
+    renamed = replace(scene, name="renamed", source=source)
+    assert train(scene=renamed, request={"train_list": "/gone.txt"})["already_finished"]
 
 
 def test_a_folder_that_is_no_run_is_never_touched(train, tmp_path):
@@ -241,6 +244,45 @@ def test_a_signal_ends_the_step_saves_and_the_same_command_goes_on(
     assert record["resumed_from"] == 18 and record["metrics"] == whole["metrics"]
     assert _same(_state(run), _state(tmp_path / "whole"))
     assert [row["step"] for row in _log(run)] == list(range(1, 41))
+
+
+@pytest.mark.parametrize("status", ["interrupted", "running"])
+def test_overwriting_a_run_cut_short_goes_on_with_it_and_no_other(
+    train, tmp_path, monkeypatch, caplog, status
+):
+    """The same command resumes, with --overwrite as without."""
+    caplog.set_level("INFO")
+    whole = train(run_dir=tmp_path / "whole")
+    step_of = FakeMethod.train_step
+
+    def interrupted_step(self, batch, step):
+        if step == 17:
+            signal.raise_signal(signal.SIGINT)
+        return step_of(self, batch, step)
+
+    def cut_short():
+        with monkeypatch.context() as patch, pytest.raises(Interrupted):
+            patch.setattr(FakeMethod, "train_step", interrupted_step)
+            train(overwrite=True)
+        path = tmp_path / "run" / "run.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"status": status}))
+
+    cut_short()
+    record = train(overwrite=True)
+    assert record["resumed_from"] == 18 and record["metrics"] == whole["metrics"]
+    assert "cut short: it goes on" in caplog.text and _same(
+        _state(tmp_path / "run"), _state(tmp_path / "whole")
+    )
+    # A finished one is thrown away, and so are one cut short of other settings, and one that failed.
+    assert train(overwrite=True)["resumed_from"] is None
+    train(seed=1, overwrite=True)
+    cut_short()
+    assert train(FakeConfig(steps=30), overwrite=True)["resumed_from"] is None
+    with pytest.raises(TrainingError):
+        train(FakeConfig(nan_at=7), checkpoint_seconds=0, overwrite=True)
+    with pytest.raises(TrainingError):
+        train(FakeConfig(nan_at=7), checkpoint_seconds=1e9, overwrite=True)
+    assert not checkpoints.list_steps(tmp_path / "run" / "checkpoints")
 
 
 def test_a_damaged_last_checkpoint_costs_steps_but_not_the_result(train, tmp_path, monkeypatch, caplog):

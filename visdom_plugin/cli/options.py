@@ -73,7 +73,8 @@ class Common(Reading):
     out: Path | None = None
     """Run directory; by default runs/<scene>/<views>/<method>/<seed>."""
     overwrite: bool = False
-    """Throw away another run that is in the run directory."""
+    """Throw away another run that is in the run directory, or this one if it is finished or has failed. If it was
+    interrupted, it goes on all the same."""
     checkpoint_seconds: float = 30.0
     """Seconds between two checkpoints; results do not depend on it."""
     config: Path | None = None

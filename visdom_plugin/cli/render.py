@@ -29,7 +29,7 @@ class Options:
     format: Literal["mp4", "png"] = "mp4"
     """A video, or a folder of numbered pictures."""
     out: Path | None = None
-    """File or folder to write; by default <run>/renders/<path>.mp4 or <run>/renders/<path>/."""
+    """File or folder to write; by default <run>/renders/<path>.mp4 or <run>/renders/<path>_frames/."""
     data: Path | None = None
     """Where the scene is now, if it has moved."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -49,16 +49,31 @@ def _render(argv: Sequence[str]) -> None:
         if getattr(options, name) < 1:
             raise ConfigError(f"--{name} is {getattr(options, name)}; it must be at least 1")
 
+    if options.format == "mp4" and options.out is not None and options.out.suffix.lower() != ".mp4":
+        raise ConfigError(
+            "the name of a video ends in .mp4",
+            where=f"--out {options.out}",
+            todo="--out NAME.mp4, or --format png for a folder of pictures",
+        )
+
     from visdom_plugin.cli.report import say
     from visdom_plugin.cli.scenes import open_run
     from visdom_plugin.training.evaluate import render_on_white
     from visdom_plugin.training.pictures import to_bytes, write_png, write_video
 
-    _, _, scene, method, hull, device, _ = open_run(options.run, options.data, options.device)
-    cameras = choose_cameras(options.path, options.frames, scene, hull)
-    target = options.out or options.run / "renders" / (
-        f"{options.path}.mp4" if options.format == "mp4" else options.path
+    _, _, scene, method, hull, device, _ = open_run(
+        options.run, options.data, options.device, test=options.path == "test"
     )
+    cameras = choose_cameras(options.path, options.frames, scene, hull)
+    target = options.out or default_target(options)
+    if options.format == "png":
+        clear_numbered(target, len(cameras), ours=options.out is None)
+    elif len(set(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))) > 1:
+        raise ConfigError(
+            "the views differ in size, which a video cannot",
+            where=f"--path {options.path}",
+            todo="--format png",
+        )
     frames = []
     for i in range(len(cameras)):
         picture = to_bytes(render_on_white(method, cameras[i], device)[0])
@@ -67,12 +82,6 @@ def _render(argv: Sequence[str]) -> None:
         else:
             frames.append(picture)
     if options.format == "mp4":
-        if len({frame.shape for frame in frames}) > 1:
-            raise ConfigError(
-                "the views differ in size, which a video cannot",
-                where=f"--path {options.path}",
-                todo="--format png",
-            )
         codec = write_video(target, frames, options.fps)
         if not options.quiet:
             say(f"{len(frames)} frames, codec {codec}")
@@ -80,13 +89,46 @@ def _render(argv: Sequence[str]) -> None:
         sys.stdout.write(f"{target}\n")
 
 
+def default_target(options: Options) -> Path:
+    """Where a path's pictures go by default; not into renders/test, which is the evaluation's."""
+    name = f"{options.path}.mp4" if options.format == "mp4" else f"{options.path}_frames"
+    return options.run / "renders" / name
+
+
+def clear_numbered(folder: Path, count: int, *, ours: bool) -> None:
+    """Sees to it that no picture of a longer path stays beside the `count` that will be written.
+
+    Args:
+        ours: whether the folder is the run's own; in any other one nothing is removed.
+
+    Raises:
+        ConfigError: there are such pictures in a folder that is not the run's own.
+    """
+    later = [p for p in folder.glob("[0-9]" * 4 + "*.png") if p.stem.isdecimal() and int(p.stem) >= count]
+    if later and not ours:
+        raise ConfigError(
+            f"the folder holds numbered pictures beyond the {count} of this path: {min(later).name}",
+            where=folder,
+            cause="a longer path was rendered into it",
+            todo="remove them, or choose another folder with --out",
+        )
+    for picture in later:
+        picture.unlink()
+
+
 def choose_cameras(path: str, frames: int, scene, hull):
-    """(frames,) cameras of a path; the views' own for "train" and "test"."""
+    """(frames,) cameras of a path; the views' own for "train" and "test".
+
+    Raises:
+        ConfigError: the path is along test views, and there are none.
+    """
     import torch
 
     from visdom_plugin.cameras import Cameras, interpolate, look_at_point, orbit
 
     if path in ("train", "test"):
+        if not len(getattr(scene, path)):
+            raise ConfigError(f"the run has no {path} views", where=f"--path {path}", todo="--path orbit")
         return getattr(scene, path).cameras
     cameras = scene.train.cameras
     centre = look_at_point(cameras) if hull is None else torch.as_tensor(hull.centre)

@@ -28,7 +28,11 @@ def show_result(record: dict[str, Any], folder: Path) -> None:
     from rich.table import Table
 
     console = Console(soft_wrap=True)
-    table = Table(title=f"{record['method']} on {record['scene']}, {len(record['data']['test'])} test views")
+    views = len(record["data"]["test"])
+    measured = record["metrics"].get("measured_views", views)
+    count = f"{views} test views" if measured == views else f"{measured} of {views} test views"
+    title = f"{record['method']} on {record['scene']}, {count}"
+    table = Table(title=title)
     table.add_column("metric")
     table.add_column("mean", justify="right")
     table.add_column("worst view", justify="right")
@@ -42,7 +46,11 @@ def show_result(record: dict[str, Any], folder: Path) -> None:
         table.add_row(
             label, f"{means[key]:.{digits}f} {unit}".rstrip(), f"{worst:.{digits}f} {unit}".rstrip()
         )
-    console.print(table)
+    if measured:
+        console.print(table)
+    else:
+        why = "no test view has a mask of its own" if views else "the scene has no test views"
+        console.print(f"{title}: nothing is measured, because {why}", highlight=False, markup=False)
     timing = record.get("timing", {})
     if "train_s" in timing:
         console.print(

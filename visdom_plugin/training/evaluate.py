@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -31,40 +34,69 @@ def evaluate(
 ) -> dict[str, Any]:
     """Measures every view and, with a folder, writes its render and the contact sheet.
 
+    A view whose mask is not its own has no truth on white: it is rendered, its metrics are NaN, it takes no part
+    in the means, and its row says `mask_origin`.
+
     Args:
         method: trained.
         views: the test views.
         reference_hull: the default visible domain of the training views, for `outside_hull_mass`; None
             leaves that metric undefined.
         device: where the method renders.
-        folder: `<folder>/test/<name>.png` and `<folder>/test_sheet.png` are written.
+        folder: `<folder>/test/<name>.png` and `<folder>/test_sheet.png` are written; other pictures in
+            `<folder>/test` are removed.
 
     Returns:
-        {"test": means, "per_view": {name: metrics}, "protocol": metrics.PROTOCOL}; see `metrics.compare`.
+        {"test": means, "per_view": {name: metrics}, "measured_views": how many the means are of, "protocol":
+        metrics.PROTOCOL}; see `metrics.compare`.
     """
     perceptual = metrics.load_lpips()
-    rows: dict[str, dict[str, float]] = {}
+    rows: dict[str, dict[str, Any]] = {}
     columns = []
     shown = shown_on_sheet(len(views))
     files = picture_names(views.names)
     for i, name in enumerate(views.names):
         rgb, alpha = render_on_white(method, views.cameras[i], device)
-        silhouette = None if reference_hull is None else hull_silhouette(reference_hull, views.cameras[i])
-        image, mask, ignore = views.images[i], views.masks[i], views.ignored(i)
-        rows[name] = metrics.compare(
-            rgb, alpha, image, mask, hull_silhouette=silhouette, perceptual=perceptual, ignore=ignore
-        )
+        measured = views.mask_origin(i) == "given"
+        if measured:
+            seen = None if reference_hull is None else hull_silhouette(reference_hull, views.cameras[i])
+            image, mask, ignore = views.images[i], views.masks[i], views.ignored(i)
+            rows[name] = metrics.compare(
+                rgb, alpha, image, mask, hull_silhouette=seen, perceptual=perceptual, ignore=ignore
+            )
+        else:
+            rows[name] = {**dict.fromkeys(metrics.NAMES, math.nan), "mask_origin": views.mask_origin(i)}
         if folder is not None:
             write_png(folder / "test" / f"{files[i]}.png", to_bytes(rgb))
             if i in shown:
-                truth = metrics.whiten(image, mask)
-                truth = to_bytes(truth if ignore is None else truth.masked_fill(ignore[..., None], 0.5))
+                title = f"{name}  " + (f"{rows[name]['psnr']:.1f} dB" if measured else "no mask")
                 grey = to_bytes(alpha[..., None].expand(-1, -1, 3))
-                columns.append((f"{name}  {rows[name]['psnr']:.1f} dB", [truth, to_bytes(rgb), grey]))
-    if folder is not None and columns:
-        write_png(folder / "test_sheet.png", draw_sheet(columns, SHEET_ROWS))
-    means = metrics.mean_over_views(list(rows.values()))
-    return {"test": means, "per_view": rows, "protocol": dict(metrics.PROTOCOL)}
+                columns.append((title, [_draw_truth(views, i, measured), to_bytes(rgb), grey]))
+    if folder is not None:
+        _remove_others(folder / "test", files)
+        if columns:
+            write_png(folder / "test_sheet.png", draw_sheet(columns, SHEET_ROWS))
+    measured_rows = [row for row in rows.values() if "mask_origin" not in row]
+    return {
+        "test": metrics.mean_over_views(measured_rows),
+        "per_view": rows,
+        "measured_views": len(measured_rows),
+        "protocol": dict(metrics.PROTOCOL),
+    }
+
+
+def _draw_truth(views: Views, i: int, measured: bool) -> np.ndarray:
+    """The photograph as bytes, on white where a mask tells what is the object."""
+    image, ignore = views.images[i], views.ignored(i)
+    truth = metrics.whiten(image, views.masks[i]) if measured else image.double() / 255
+    return to_bytes(truth if ignore is None else truth.masked_fill(ignore[..., None], 0.5))
+
+
+def _remove_others(folder: Path, names: Sequence[str]) -> None:
+    """Removes pictures that an evaluation of other views left behind."""
+    for path in folder.glob("*.png"):
+        if path.stem not in names:
+            path.unlink()
 
 
 def render_on_white(method: Method, camera: Cameras, device: torch.device) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,9 @@ of the background beside it. As "hull" it is the view's mask. As "colour" it onl
 at: outside nothing is asked, inside the photograph's colours are asked of whatever the model has there (see
 `losses.composite`), and the mask loss is left out. In neither case does the view carve: its outline comes from
 the others and would count their votes twice.
+
+Nothing stands in for the mask of a test view: a render measured against the hull's outline would be praised for
+filling the hull. Such a view is rendered and not measured.
 """
 
 from __future__ import annotations
@@ -27,9 +30,9 @@ Way = Literal["error", "colour", "hull"]
 
 
 def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> Scene:
-    """A scene in which every view has a mask of some kind.
+    """A scene in which every training view has a mask of some kind.
 
-    Test views without one are measured against the hull's outline whatever the way, and say so.
+    Test views without one stay without, and a warning says that they are not measured.
 
     Args:
         scene: whose views without a mask have the mask origin "missing".
@@ -41,35 +44,39 @@ def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> S
         The same scene when no mask is missing.
 
     Raises:
-        SceneError: masks are missing and `way` is "error", or fewer than two training views have one.
+        SceneError: masks are missing and `way` is "error", or training views lack one and fewer than two have
+            one.
         EmptyHullError: the masks that are there leave no hull.
     """
-    missing = {name: [i for i in range(len(v)) if v.mask_origin(i) == "missing"] for name, v in _parts(scene)}
-    if not any(missing.values()):
-        return scene
-    absent = [views.names[i] for name, views in _parts(scene) for i in missing[name]]
-    given = len(scene.train) - len(missing["train"])
-    if way == "error" or given < 2:
+    missing, unmeasured = _missing(scene.train), _missing(scene.test)
+    given = len(scene.train) - len(missing)
+    if (missing or unmeasured) and way == "error":
+        absent = [scene.train.names[i] for i in missing] + [scene.test.names[i] for i in unmeasured]
         raise SceneError(
-            f"{len(absent)} views have no mask: {', '.join(absent[:5])}{', ...' if len(absent) > 5 else ''}",
+            f"{len(absent)} views have no mask: {_list(absent)}",
             where=scene.name,
-            cause=f"and only {given} training views have one: a hull needs two" if way != "error" else None,
-            todo="make masks for them"
-            if way != "error"
-            else "make masks for them, or pass --data.missing-masks colour|hull",
+            todo="make masks for them, or pass --data.missing-masks colour|hull",
+        )
+    if unmeasured:
+        log.warning(
+            "%d of %d test views have no mask: they are rendered, but not measured (%s)",
+            len(unmeasured), len(scene.test), _list([scene.test.names[i] for i in unmeasured]),
+        )  # fmt: skip
+    if not missing:
+        return scene
+    if given < 2:
+        raise SceneError(
+            f"{len(missing)} training views have no mask: {_list([scene.train.names[i] for i in missing])}",
+            where=scene.name,
+            cause=f"and only {given} training views have one: a hull needs two",
+            todo="make masks for them",
         )
     domain = VisibleDomain(k=min(3, given)) if domain is None else domain
-    hull = domain.carve(*scene.train.silhouettes())
-    outlines = {name: outline_views(hull, views, missing[name]) for name, views in _parts(scene)}
-    for name, views in _parts(scene):
-        for i, outline in outlines[name].items():
-            if not bool(outline.any()):
-                log.warning("%s has no mask and does not see the hull of the other views", views.names[i])
-    return replace(
-        scene,
-        train=_filled(scene.train, outlines["train"], way),
-        test=_filled(scene.test, outlines["test"], "hull"),
-    )
+    outlines = outline_views(domain.carve(*scene.train.silhouettes()), scene.train, missing)
+    for i, outline in outlines.items():
+        if not bool(outline.any()):
+            log.warning("%s has no mask and does not see the hull of the other views", scene.train.names[i])
+    return replace(scene, train=_filled(scene.train, outlines, way))
 
 
 def outline_views(hull, views: Views, indices: Sequence[int]) -> dict[int, Tensor]:
@@ -79,13 +86,15 @@ def outline_views(hull, views: Views, indices: Sequence[int]) -> dict[int, Tenso
     return {i: depth_and_silhouette(hull, views.cameras[i].to("cpu"))[1] for i in indices}
 
 
-def _parts(scene: Scene) -> tuple[tuple[str, Views], tuple[str, Views]]:
-    return ("train", scene.train), ("test", scene.test)
+def _missing(views: Views) -> list[int]:
+    return [i for i in range(len(views)) if views.mask_origin(i) == "missing"]
+
+
+def _list(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 def _filled(views: Views, outlines: dict[int, Tensor], way: Way) -> Views:
-    if not outlines:
-        return views
     origins = tuple(way if i in outlines else views.mask_origin(i) for i in range(len(views)))
     filled = replace(views, masks=_Replaced(views.masks, outlines), mask_origins=origins)
     if way != "colour":

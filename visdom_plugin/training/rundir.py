@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import shutil
 from contextlib import suppress
@@ -24,9 +25,14 @@ from visdom_plugin.training.checkpoints import list_steps
 from visdom_plugin.training.files import MARK, remove_parts, write_bytes, write_json
 from visdom_plugin.training.settings import as_plain, differences
 
+log = logging.getLogger(__name__)
+
 SCHEMA = 1
 IDENTITY = ("method", "scene", "seed", "config", "data")
-"""Fields of run.json that must agree for a run to be resumed."""
+"""Fields of run.json that say which run it is."""
+_WHEREABOUTS = ("path", "root", "split", "train_list", "test_list")
+"""What `data` says of where the data lies and how its views were chosen. That may change, as may the scene's name;
+what must agree for a run to be resumed are the views' names, the hashes, and the other fields of `IDENTITY`."""
 _OURS = ("log.jsonl", "checkpoints", "hull", "renders", "export", "run.json")
 _LOCK = "run.lock"
 
@@ -104,7 +110,7 @@ class RunDir:
 
         Args:
             identity: the fields `IDENTITY`.
-            overwrite: throw away the run that is there, whatever it is.
+            overwrite: throw away the run that is there, unless it is the same one and was cut short.
 
         Raises:
             CheckpointError: when the directory holds another run or foreign files, or when another process
@@ -133,7 +139,7 @@ class RunDir:
             remove_parts(run.path)
             run._is_new = not (run.path / "run.json").exists()
             if not run._is_new:
-                if overwrite:
+                if overwrite and not run._goes_on(identity):
                     run._clear()
                 else:
                     run.record = read_record(run.path)
@@ -239,22 +245,36 @@ class RunDir:
             else:
                 target.unlink(missing_ok=True)
 
+    def _goes_on(self, identity: dict[str, Any]) -> bool:
+        """Whether the directory holds this very run, interrupted or killed."""
+        try:
+            record = read_record(self.path)
+        except CheckpointError:
+            return False
+        same = not differences(_decisive(record), _decisive(identity))
+        if not same or record.get("status") not in ("interrupted", "running"):
+            return False
+        log.info("the run directory holds this run, cut short: it goes on (--overwrite is for other runs)")
+        return True
+
     def _refuse_other(self, identity: dict[str, Any]) -> None:
-        there = {name: self.record.get(name) for name in IDENTITY}
-        # Where the data lies may change; what it is may not.
-        for record in (there, identity := dict(identity)):
-            data = record.get("data")
-            record["data"] = (
-                {k: v for k, v in data.items() if k != "path"} if isinstance(data, dict) else data
-            )
-        lines = differences(there, identity)
-        if lines:
+        if differences(_decisive(self.record), _decisive(identity)):
+            there, now = ({name: record.get(name) for name in IDENTITY} for record in (self.record, identity))
+            lines = differences(there, now)
             more = f"\n    and {len(lines) - 8} more" if len(lines) > 8 else ""
             raise CheckpointError(
                 "the run directory holds another run (there -> now):\n    " + "\n    ".join(lines[:8]) + more,
                 where=self.path,
                 todo="choose another directory with --out, or replace what is there with --overwrite",
             )
+
+
+def _decisive(record: dict[str, Any]) -> dict[str, Any]:
+    """What must agree in two records of one run."""
+    data = record.get("data")
+    if isinstance(data, dict):
+        data = {name: value for name, value in data.items() if name not in _WHEREABOUTS}
+    return {name: record.get(name) for name in IDENTITY if name != "scene"} | {"data": data}
 
 
 def read_record(path: Path) -> dict[str, Any]:
