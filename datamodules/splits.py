@@ -9,11 +9,12 @@ import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-from datamodules.paths import read_inside, read_plain
+from datamodules.paths import read_inside
 from datamodules.request import Request
-from visdom_plugin.errors import ConfigError, SceneError
+from datamodules.view_lists import is_integer, read_list
+from visdom_plugin.errors import SceneError
 
 log = logging.getLogger(__name__)
 
@@ -77,14 +78,14 @@ def choose(
     train = tested = None
     train_where, test_where = "--train-list", "--test-list"
     if request.train_list is not None:
-        train = _by_hand(request.train_list, names, train_where)
+        train = read_list(request.train_list, names, train_where)
         rules.append("training views as listed by hand")
         if request.views not in (None, len(train)):
             log.info("%s lists %d views; --views %d is ignored", train_where, len(train), request.views)
     if not request.test:
         tested = []
     elif request.test_list is not None:
-        tested = _by_hand(request.test_list, names, test_where)
+        tested = read_list(request.test_list, names, test_where)
     files = _index_files(root)
     if train is None and (indexed or files):
         views = min(files, default=None) if request.views is None else request.views
@@ -178,48 +179,6 @@ def _check_length(root: Path, name: str, train: list[int], views: int) -> None:
         )
 
 
-def _by_hand(text: str, names: Sequence[str], where: str) -> list[int]:
-    """Positions of a comma list of positions and names, or of an index file anywhere on the disk."""
-    path = Path(text).expanduser() if text.startswith("~") else Path(text)
-    try:
-        is_file = path.is_file()
-    except (OSError, ValueError):
-        is_file = False
-    if is_file:
-        try:
-            words = read_plain(path, 2**24).decode("utf-8", errors="replace").replace(",", " ").split()
-        except OSError as error:
-            raise ConfigError(
-                f"the list cannot be read: {error.strerror}", where=f"{where} {text}"
-            ) from error
-    else:
-        words = [word.strip() for word in text.split(",") if word.strip()]
-    by_name = {PurePosixPath(name).with_suffix("").as_posix(): i for i, name in enumerate(names)}
-    by_name |= {name: i for i, name in enumerate(names)}
-    positions = []
-    for word in words:
-        if word in by_name:
-            positions.append(by_name[word])
-        elif _is_integer(word) and 0 <= int(word) < len(names):
-            positions.append(int(word))
-        else:
-            raise ConfigError(
-                f"{where} names {word[:60]!r}, which is no view of this scene",
-                where=f"{where} {text[:200]}",
-                cause=None if is_file or "," in text else "there is no such file either",
-                todo=f"list positions from 0 to {len(names) - 1} or names such as {names[0]}, with commas between",
-            )
-    if not positions or len(set(positions)) < len(positions):
-        raise ConfigError(
-            f"{where} lists {'a view twice' if positions else 'no views'}", where=f"{where} {text[:200]}"
-        )
-    return positions
-
-
-def _is_integer(word: str) -> bool:
-    return word.isascii() and word.removeprefix("-").isdecimal() and len(word) < 12
-
-
 def _read(root: Path, name: str, count: int, outside: bool) -> tuple[list[int], str]:
     data = read_inside(root, name, outside=outside, most=2**24)
     return parse_positions(data, count, root / name), hashlib.sha256(data).hexdigest()
@@ -232,9 +191,9 @@ def parse_positions(data: bytes, count: int, path: Path) -> list[int]:
         SceneError: for anything but at least one integer in [0, count), none of them twice.
     """
     name = path.name
-    words = data.decode("utf-8", errors="replace").split()
+    words = data.decode("utf-8-sig", errors="replace").split()
     for word in words:
-        if not _is_integer(word):
+        if not is_integer(word):
             raise SceneError(
                 f"{name} holds {word[:40]!r}, which is not an integer",
                 where=path,
