@@ -31,12 +31,12 @@ def test_a_file_of_positions_means_what_it_means_as_the_scenes_own(tmp_path_fact
 @pytest.mark.parametrize("position", range(12))
 def test_a_number_with_two_meanings_is_refused_with_both(position, tmp_path):
     word = str(position)
-    for given in (word, f"2.png,{word}"):
+    for text in (word, f"2.png,{word}"):
         if f"{word}.png" not in NUMBERED:
-            assert read_list(given, NUMBERED, "--train-list")[-1] == position
+            assert read_list(text, NUMBERED, "--train-list")[-1] == position
             continue
         with pytest.raises(ConfigError, match=f"{word} could be .* {word}.png, or position {word}") as caught:
-            read_list(given, NUMBERED, "--train-list")
+            read_list(text, NUMBERED, "--train-list")
         # What it advises works, for either meaning.
         for name in (f"{word}.png", NUMBERED[position]):
             assert name in caught.value.todo
