@@ -16,6 +16,7 @@ from visdom_plugin.hull.diagnose import look_inverted
 from visdom_plugin.hull.findings import Finding, Name
 from visdom_plugin.hull.maskfaults import check_border, check_content, check_sizes, find_repeated
 from visdom_plugin.hull.outlines import OBJECT_PX, Outlines, draw_outlines
+from visdom_plugin.hull.poses import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.suspects import QUIET_PX, Suspicion, explain
 from visdom_plugin.hull.votes import gather_silhouettes
 
@@ -49,6 +50,7 @@ def check(
     *,
     k: int | None = None,
     brief: bool = False,
+    poses: PoseFaults = IN_MEMORY,
 ) -> Check:
     """Looks for every fault that shows in cameras and masks, and for photographs that occur twice.
 
@@ -59,6 +61,7 @@ def check(
         names: the views' names, for the sentences.
         k: the K that is going to be used; by default it is to be advised.
         brief: a fraction of a second; names a fault but not always its cause, and compares 16 views at most.
+        poses: what to say of wrong poses, in the terms of where they are from.
     """
     masks = [np.asarray(m.detach().cpu() if hasattr(m, "detach") else m).astype(bool) for m in masks]
     names = Name([f"view {i}" for i in range(len(masks))] if names is None else names)
@@ -85,10 +88,10 @@ def check(
     found += inverted
     turned = {v for f in inverted for v in f.views}
     found += check_border([m if i not in turned else ~m for i, m in enumerate(masks)], names)
-    causes, fit, left = explain(outlines, brief=brief)
+    causes, fit, left = explain(outlines, brief=brief, poses=poses)
     repeated, causes = _join(repeated, causes, usable, names)
     found += repeated
-    found += [_cause(c, usable, names, fit) for c in causes]
+    found += [_cause(c, usable, names, poses) for c in causes]
     ambiguous = any(c.rivals for c in causes)
     if fit.score > _DISAGREE_PX and not ambiguous:
         found.append(_disagreement(fit, usable[left], names))
@@ -180,7 +183,6 @@ def _share(px: float) -> str:
 
 
 _TODO = {
-    "axes": 'hand the poses over in their own convention: convention="opengl", or the inverse matrices',
     "scale": "scale the intrinsics with the images: a photograph resized by s has s times the focal length and "
     "principal point",
     "order": "check how images, masks and poses are matched: sort them by the same key",
@@ -189,7 +191,7 @@ _TODO = {
 }
 
 
-def _cause(cause: Suspicion, usable: np.ndarray, names: Name, fit: Coherence) -> Finding:
+def _cause(cause: Suspicion, usable: np.ndarray, names: Name, poses: PoseFaults) -> Finding:
     views = tuple(int(usable[v]) for v in cause.views)
     gain = (
         f"undone, masks and cameras miss each other by {_share(cause.after)} of the object's length in the "
@@ -219,8 +221,9 @@ def _cause(cause: Suspicion, usable: np.ndarray, names: Name, fit: Coherence) ->
     ratio = min(cause.after / max(cause.before, 1e-9), 1.0)
     sure = "certain" if cause.before > _DISAGREE_PX and ratio < 0.1 else "likely"
     sure = "possible" if cause.rivals or cause.others else sure
+    todo = dict(poses)[cause.detail] if cause.kind == "axes" else _TODO[cause.kind]
     alternatives = tuple(sorted({kind for kind, _, _ in cause.others}))
-    return Finding(cause.kind, f"{what}: {gain}", views, sure, 1 - ratio, _TODO[cause.kind], alternatives)
+    return Finding(cause.kind, f"{what}: {gain}", views, sure, 1 - ratio, todo, alternatives)
 
 
 def _disagreement(fit: Coherence, views: np.ndarray, names: Name) -> Finding:
