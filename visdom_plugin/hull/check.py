@@ -13,6 +13,7 @@ from visdom_plugin.cameras import Cameras, look_at_point
 from visdom_plugin.hull.coherence import Coherence, measure_coherence
 from visdom_plugin.hull.covisibility import LOST, USUAL_K, Advice, advise_k, measure_spread
 from visdom_plugin.hull.diagnose import look_inverted
+from visdom_plugin.hull.empty import ways_to_set_k
 from visdom_plugin.hull.findings import Finding, Name
 from visdom_plugin.hull.maskfaults import check_border, check_content, check_sizes, find_repeated
 from visdom_plugin.hull.outlines import OBJECT_PX, Outlines, draw_outlines
@@ -257,7 +258,7 @@ def _covisibility(advice: Advice, views: np.ndarray, asked: int | None) -> list[
             tuple(int(v) for v in views[lost > LOST]),
             "certain",
             float(lost.max()),
-            f'use -k {advice.k} or k="auto", or views that show more of the object in common',
+            f'use {ways_to_set_k(advice.k)} or k="auto", or views that show more of the object in common',
             note=asked is None and advice.k > 1,
         )
     ]

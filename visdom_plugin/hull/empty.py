@@ -57,7 +57,7 @@ def _list(views: Sequence[int]) -> str:
     return f"view {shown}" if len(views) == 1 else f"views {shown}"
 
 
-def _lower_k(k: int) -> str:
+def ways_to_set_k(k: int) -> str:
     """How K is set, wherever the hull is asked for."""
     return f"K = {k} (visdom-hull -k {k}, visdom-train --method.hull.k {k}, VisibleDomain(k={k}))"
 
@@ -88,7 +88,7 @@ def _too_few_views(domain, cameras, silhouettes):
     if k <= len(silhouettes):
         return None
     cause = f"K = {k} is larger than co-visibility allows: there are only {len(silhouettes)} views"
-    return cause, f"use more views, or {_lower_k(min(3, len(silhouettes)))} or less", None
+    return cause, f"use more views, or {ways_to_set_k(min(3, len(silhouettes)))} or less", None
 
 
 def _beside(domain, cameras, silhouettes):
@@ -159,7 +159,7 @@ def _covisibility(domain, cameras, silhouettes):
     for fewer in range(k - 1, 0, -1):
         if _try(replace(domain, k=fewer), cameras, silhouettes) >= _CONVINCING:
             cause = f"K = {k} is larger than co-visibility: too little is seen by more than {fewer}"
-            return cause, f"use {_lower_k(fewer)}, or views that see more of the object in common", "k"
+            return cause, f"use {ways_to_set_k(fewer)}, or views that see more of the object in common", "k"
     return None
 
 
