@@ -24,6 +24,8 @@ from visdom_plugin.hull.votes import gather_silhouettes
 CLUSTERED_DEGREES = 60.0
 """Views within this angle leave a hull more than 1.7 times as deep as the object."""
 _DISAGREE_PX, _SPEAKING_PX = 0.1, 0.5
+_MIDDLE = 0.25
+"""Principal points further than this from the images' centres, in image sizes, are outside their middle half."""
 _RAYS, _BRIEF_VIEWS = 1024, 16
 
 
@@ -80,6 +82,8 @@ def check(
     repeated = _repeated(masks, images, out, names)
     if brief and len(usable) > _BRIEF_VIEWS:
         usable = usable[np.arange(_BRIEF_VIEWS) * len(usable) // _BRIEF_VIEWS]
+    if len(masks) < 2:
+        found.append(_too_few(len(masks)))
     if len(usable) < 2:
         notes, found = _split([*found, *repeated])
         return Check(found, notes, None, None, tuple(usable.tolist()))
@@ -90,6 +94,10 @@ def check(
     turned = {v for f in inverted for v in f.views}
     found += check_border([m if i not in turned else ~m for i, m in enumerate(masks)], names)
     causes, fit, left = explain(outlines, brief=brief, poses=poses)
+    astray = _astray(chosen)
+    if astray and _views_alone(causes, fit):
+        notes, found = _split([*found, *repeated, astray])
+        return Check(found, notes, None, fit, tuple(usable.tolist()))
     repeated, causes = _join(repeated, causes, usable, names)
     found += repeated
     found += [_cause(c, usable, names, poses) for c in causes]
@@ -110,6 +118,18 @@ def check(
 
 def _split(found: list[Finding]) -> tuple[list[Finding], list[Finding]]:
     return [f for f in found if f.note], [f for f in found if not f.note]
+
+
+def _too_few(count: int) -> Finding:
+    return Finding(
+        "few",
+        f"there is {'one view' if count else 'no view'} with a mask: nothing says how deep the object is, and no "
+        "hull can be carved",
+        tuple(range(count)),
+        "certain",
+        count,
+        "use more views: --views 3 or more",
+    )
 
 
 def _repeated(masks, images, out: set[int], names: Name) -> list[Finding]:
@@ -159,6 +179,35 @@ def _inverted(outlines: Outlines, masks, usable: np.ndarray, names: Name):
         "invert them: white (True) on the object",
     )
     return [said], turned
+
+
+def _astray(cameras: Cameras) -> Finding | None:
+    """Principal points outside the middle half of most images."""
+    K = cameras.intrinsics.double().cpu().numpy()
+    points = K[:, :2, 2]
+    shares = points / torch.stack([cameras.width, cameras.height], -1).cpu().numpy()
+    out = np.abs(shares - 0.5).max(1) > _MIDDLE
+    if 2 * out.sum() <= len(out):
+        return None
+    (x, y), (across, down) = np.median(points, 0), np.median(shares, 0)
+    normalised = bool((points <= 1).all(1).mean() > 0.5)
+    return Finding(
+        "principal",
+        f"the principal points (cx, cy) lie at ({x:.4g}, {y:.4g}) pixels, {across:.0%} of the images' width and "
+        f"{down:.0%} of their height, and the views do not fit together",
+        (),
+        "certain" if normalised else "likely",
+        float(out.mean()),
+        "multiply cx by the width and cy by the height: they are normalised"
+        if normalised
+        else "give cx and cy in pixels from the image's upper left corner, and scale them with the images",
+    )
+
+
+def _views_alone(causes: list[Suspicion], fit: Coherence) -> bool:
+    """Whether something is wrong, and nothing but single views is there to blame."""
+    wrong = bool(causes) or fit.score > _DISAGREE_PX or fit.power < _SPEAKING_PX
+    return wrong and all(c.kind == "view" for c in causes)
 
 
 def _join(repeated: list[Finding], causes: list[Suspicion], usable, names: Name):
