@@ -119,7 +119,9 @@ def choose_files(capture: Capture, request: Request) -> Chosen:
     wanted = [*split.train, *split.test]
     folder, factor = _photographs(capture, request.downscale / capture.shrunk, request)
     masks = assign_masks(capture, wanted, request)
-    return Chosen(split, folder, factor, [_files(capture, i, folder, masks[i], request) for i in wanted])
+    ignored = find_ignored(capture, wanted, request)
+    files = [_files(capture, i, folder, masks[i], ignored.get(i)) for i in wanted]
+    return Chosen(split, folder, factor, files)
 
 
 def open_capture(capture: Capture, request: Request) -> Scene:
@@ -285,15 +287,15 @@ def _photographs(capture: Capture, downscale: float, request: Request) -> tuple[
     )
 
 
-def _files(capture: Capture, index: int, folder: str | None, mask: str | None, request: Request) -> ViewFiles:
+def _files(
+    capture: Capture, index: int, folder: str | None, mask: str | None, ignored: str | None
+) -> ViewFiles:
     frame = capture.frames[index]
     image = frame.image
     if folder is not None and folder != capture.photographs:
         below = image.removeprefix(f"{capture.photographs}/")
         image = f"{folder}/{below}" if below != image else image
-    excluded = frame.excluded
-    if excluded is None and (capture.root / "ignore").is_dir():
-        excluded = find_ignored(capture, index, request)
+    excluded = frame.excluded or ignored
     return ViewFiles(frame.name, image, mask, frame.ignore, excluded, frame.depth)
 
 

@@ -106,6 +106,11 @@ def refuse_empty(mask: np.ndarray, peak: float, path: Path) -> None:
             "the mask holds 0 and 1 where 0 and 255 are meant, or 8-bit values in a 16-bit file",
             "multiply the masks by 255, or save them with 8 bits",
         )
+    elif 0.02 <= peak <= 0.5:
+        cause, todo = (
+            f"the mask's brightest value is {round(peak * 255)} of 255, and only what is above one half is object",
+            "save the masks with 0 and 255",
+        )
     elif peak > 0.5:
         cause, todo = "the object is thinner than a pixel at this size", "use a smaller --downscale"
     else:

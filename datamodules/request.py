@@ -18,7 +18,8 @@ class Request:
     downscale: float = 1
     """>= 1, how much smaller than the photographs to work."""
     test: bool = True
-    """False leaves the test views out and does not look at their files."""
+    """False leaves the test views out and does not look at their files. Training views stay the same; only where
+    more are wanted than the layout's test views leave, these are taken as well."""
     train_list: str | None = None
     """Training views by hand: an index file, or positions and names with commas between."""
     test_list: str | None = None

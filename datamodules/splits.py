@@ -9,15 +9,18 @@ import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-from datamodules.paths import read_inside, read_plain
+from datamodules.paths import read_inside
 from datamodules.request import Request
-from visdom_plugin.errors import ConfigError, SceneError
+from datamodules.view_lists import is_integer, read_list
+from visdom_plugin.errors import SceneError
 
 log = logging.getLogger(__name__)
 
 DEFAULT_VIEWS = 4
+_LISTED = 16
+"""Longest list of views that an error spells out."""
 
 
 @dataclass(frozen=True)
@@ -74,19 +77,15 @@ def choose(
         ConfigError: the same of a list given by hand.
     """
     count, hashes, rules = len(names), {}, []
-    train = tested = None
+    train = held = None
     train_where, test_where = "--train-list", "--test-list"
+    files = _index_files(root)
     if request.train_list is not None:
-        train = _by_hand(request.train_list, names, train_where)
+        train = read_list(request.train_list, names, train_where)
         rules.append("training views as listed by hand")
         if request.views not in (None, len(train)):
             log.info("%s lists %d views; --views %d is ignored", train_where, len(train), request.views)
-    if not request.test:
-        tested = []
-    elif request.test_list is not None:
-        tested = _by_hand(request.test_list, names, test_where)
-    files = _index_files(root)
-    if train is None and (indexed or files):
+    elif indexed or files:
         views = min(files, default=None) if request.views is None else request.views
         if views in files:
             train_where = f"sparse_{views}.txt"
@@ -95,7 +94,11 @@ def choose(
             rules.append(f"training views of {train_where}")
         elif indexed:
             _no_index_file(root, views, sorted(files))
-    if tested is None and ((root / "sparse_test.txt").is_file() or indexed):
+    if not request.test and train is not None:
+        held = []
+    elif request.test_list is not None:
+        held = read_list(request.test_list, names, test_where)
+    elif (root / "sparse_test.txt").is_file() or (indexed and request.test):
         test_where = "sparse_test.txt"
         if not (root / test_where).is_file():
             raise SceneError(
@@ -103,36 +106,51 @@ def choose(
                 where=root,
                 todo="write the zero-based positions of the views to test on into it, one per line",
             )
-        tested, hashes[test_where] = _read(root, test_where, count, request.allow_outside)
-    if tested is None:
+        held, hashes[test_where] = _read(root, test_where, count, request.allow_outside)
+    listed = held is not None
+    if held is None:
         taken = set(train or ())
-        tested = [i for i in pools.test if i not in taken] if request.hold_out else []
+        held = [i for i in pools.test if i not in taken] if request.hold_out else []
         rules.append(pools.rule if request.hold_out else "no view is held out")
     if train is None:
-        # Test views by the layout's rule stay out of training even when nobody asks for them.
-        unasked = not request.test and request.test_list is None and request.hold_out
-        free = set(pools.test) if unasked else set(tested)
-        pool = pools.train if request.hold_out else sorted({*pools.train, *pools.test})
-        train, rule = _spread(root, names, [i for i in pool if i not in free], request.views)
+        # Test views stay out of training even when nobody asks for them: --views N means the same everywhere.
+        every = [i for i in sorted({*pools.train, *pools.test}) if not (listed and i in held)]
+        pool = [i for i in pools.train if i not in held] if request.hold_out else every
+        if not request.test and request.hold_out and len(pool) < (request.views or 1) <= len(every):
+            log.info(
+                "%s: %d views are all but those for testing, so these are taken as well", root, len(pool)
+            )
+            pool, rules = every, [*rules[:-1], "no view is held out"]
+        train, rule = _spread(root, names, pool, every, request.views)
         rules.append(rule)
+    tested = held if request.test else []
     _refuse_shared(train, tested, f"{train_where} and {test_where}", root)
     return Split(train, tested, hashes, "; ".join(rules))
 
 
-def _spread(root: Path, names: Sequence[str], pool: list[int], views: int | None) -> tuple[list[int], str]:
+def _spread(
+    root: Path, names: Sequence[str], pool: list[int], every: list[int], views: int | None
+) -> tuple[list[int], str]:
+    """Views of the pool, and the rule in words; `every` holds those that could be listed by hand."""
     wanted = min(DEFAULT_VIEWS, len(pool)) if views is None else views
     if not pool or not 1 <= wanted <= len(pool):
+        todo = f"pass --views with 1 to {len(pool)}" if pool else "choose by hand with --train-list"
+        if len(pool) < wanted <= min(len(every), _LISTED):
+            by_hand = ",".join(map(str, spread(every, wanted)))
+            todo += f"; or train on views that are for testing, too: --train-list {by_hand}"
+            if wanted == len(names):
+                todo += " (where no view is left to test on, visdom-eval --leave-one-out measures)"
+        elif pool:
+            todo += ", or choose by hand with --train-list and --test-list"
         raise SceneError(
             f"{wanted} training views are wanted, but {len(pool)} of the {len(names)} views are for training",
             where=root,
-            todo=f"pass --views with 1 to {len(pool)}, or choose by hand with --train-list and --test-list"
-            if pool
-            else "choose by hand with --train-list and --test-list",
+            todo=todo,
         )
     train = spread(pool, wanted)
     shown = ", ".join(names[i] for i in train[:12]) + (", ..." if len(train) > 12 else "")
     log.info(
-        "%s: no index file for %d views; they are spread evenly over the %d that are not for testing: %s",
+        "%s: no index file for %d views; they are spread evenly over the %d free ones: %s",
         root,
         wanted,
         len(pool),
@@ -178,48 +196,6 @@ def _check_length(root: Path, name: str, train: list[int], views: int) -> None:
         )
 
 
-def _by_hand(text: str, names: Sequence[str], where: str) -> list[int]:
-    """Positions of a comma list of positions and names, or of an index file anywhere on the disk."""
-    path = Path(text).expanduser() if text.startswith("~") else Path(text)
-    try:
-        is_file = path.is_file()
-    except (OSError, ValueError):
-        is_file = False
-    if is_file:
-        try:
-            words = read_plain(path, 2**24).decode("utf-8", errors="replace").replace(",", " ").split()
-        except OSError as error:
-            raise ConfigError(
-                f"the list cannot be read: {error.strerror}", where=f"{where} {text}"
-            ) from error
-    else:
-        words = [word.strip() for word in text.split(",") if word.strip()]
-    by_name = {PurePosixPath(name).with_suffix("").as_posix(): i for i, name in enumerate(names)}
-    by_name |= {name: i for i, name in enumerate(names)}
-    positions = []
-    for word in words:
-        if word in by_name:
-            positions.append(by_name[word])
-        elif _is_integer(word) and 0 <= int(word) < len(names):
-            positions.append(int(word))
-        else:
-            raise ConfigError(
-                f"{where} names {word[:60]!r}, which is no view of this scene",
-                where=f"{where} {text[:200]}",
-                cause=None if is_file or "," in text else "there is no such file either",
-                todo=f"list positions from 0 to {len(names) - 1} or names such as {names[0]}, with commas between",
-            )
-    if not positions or len(set(positions)) < len(positions):
-        raise ConfigError(
-            f"{where} lists {'a view twice' if positions else 'no views'}", where=f"{where} {text[:200]}"
-        )
-    return positions
-
-
-def _is_integer(word: str) -> bool:
-    return word.isascii() and word.removeprefix("-").isdecimal() and len(word) < 12
-
-
 def _read(root: Path, name: str, count: int, outside: bool) -> tuple[list[int], str]:
     data = read_inside(root, name, outside=outside, most=2**24)
     return parse_positions(data, count, root / name), hashlib.sha256(data).hexdigest()
@@ -232,9 +208,9 @@ def parse_positions(data: bytes, count: int, path: Path) -> list[int]:
         SceneError: for anything but at least one integer in [0, count), none of them twice.
     """
     name = path.name
-    words = data.decode("utf-8", errors="replace").split()
+    words = data.decode("utf-8-sig", errors="replace").split()
     for word in words:
-        if not _is_integer(word):
+        if not is_integer(word):
             raise SceneError(
                 f"{name} holds {word[:40]!r}, which is not an integer",
                 where=path,

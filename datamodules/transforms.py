@@ -238,7 +238,8 @@ def _find_photograph(root: Path, file_path: str, request: Request) -> str:
     if PurePosixPath(file_path).suffix.lower() in _PHOTOGRAPHS:
         return file_path
     check_name(file_path, root, outside=request.allow_outside)
-    found = [file_path + end for end in _PHOTOGRAPHS if (root / (file_path + end)).exists()]
+    ends = (*_PHOTOGRAPHS, *(end.upper() for end in _PHOTOGRAPHS))
+    found = [file_path + end for end in ends if (root / (file_path + end)).exists()]
     return found[0] if found else file_path + ".png"
 
 

@@ -13,6 +13,8 @@ from visdom_plugin.cli.hull import main
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import Scene, Views
 
+CAMERAS = ("train", "test", "orbit")
+
 
 @pytest.fixture
 def scene(monkeypatch):
@@ -49,6 +51,17 @@ def test_json_is_one_object_with_what_is_promised(scene, capsys):
     assert (
         report["components"] == 1 and report["seconds"] >= 0 and "not one miss" in report["agreement_means"]
     )
+
+
+def test_test_views_are_read_only_for_masks_seen_by_their_cameras(scene, tmp_path):
+    words = ["somewhere", "--resolution", "32", "--quiet"]
+    for more in (
+        [],
+        ["--cameras", "test"],
+        *(["--masks-out", str(tmp_path / c), "--cameras", c] for c in CAMERAS),
+    ):
+        assert main([*words, *more, "--frames", "2"]) == 0
+    assert [keywords["test"] for _, keywords in scene] == [False, False, *(c == "test" for c in CAMERAS)]
 
 
 def test_files_hold_the_hull(scene, tmp_path, capsys):

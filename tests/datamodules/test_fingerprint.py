@@ -78,6 +78,19 @@ def _dynamic(scene, folder):
     return folder
 
 
+def _elsewhere(scene, folder):
+    """Photographs in a folder of their own, masks and ignored pixels by bare name with endings in capitals."""
+    w.write_nerfstudio(_all(scene), folder)
+    text = (folder / "transforms.json").read_text()
+    (folder / "transforms.json").write_text(text.replace("images/", "photos/"))
+    (folder / "images").rename(folder / "photos")
+    for path in (folder / "masks").iterdir():
+        path.rename(path.with_suffix(".PNG"))
+    (folder / "ignore").mkdir()
+    write(folder / f"ignore/{scene.train.names[0]}.png", np.zeros((24, 32), np.uint8))
+    return folder
+
+
 def _smaller(scene, folder):
     w.write_mip360(_all(scene), folder)
     for path in (folder / "masks").iterdir():
@@ -102,6 +115,7 @@ LAYOUTS = {
     "nerfstudio, alpha": (lambda s, f: w.write_nerfstudio(_all(s), f, alpha=True), {"mask_source": "alpha"}),
     "nerfstudio, files named": (_pointed, {"mask_path": "foreground"}),
     "nerfstudio, pixels ignored": (_pointed, {"mask_path": "ignore", "allow_missing_masks": True}),
+    "nerfstudio, masks by bare name": (_elsewhere, {}),
     "instant-ngp": (lambda s, f: w.write_instant_ngp(_all(s), f), {}),
     "instant-ngp, dynamic masks": (_dynamic, {}),
     "blender": (_blender, {}),

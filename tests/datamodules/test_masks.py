@@ -112,7 +112,15 @@ def test_a_file_and_an_alpha_channel_that_disagree_are_both_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "value, said", [(0, "found nothing"), (1 / 255, "0 and 1"), (0.9, "thinner than a pixel")]
+    ("value", "said"),
+    [
+        (0, "found nothing"),
+        (1 / 255, "0 and 1"),
+        (10 / 255, "10 of 255"),
+        (127 / 255, "127 of 255, and only what is above one half"),
+        (0.5, "above one half"),
+        (0.9, "thinner than a pixel"),
+    ],
 )
 def test_an_empty_mask_says_why(value, said):
     with pytest.raises(SceneError, match=said):

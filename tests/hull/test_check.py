@@ -91,6 +91,46 @@ def test_planted_faults_are_named(captures, name, views, fault):
     assert all(f.todo and f.what and f.sure in ("certain", "likely", "possible") for f in found.findings)
 
 
+def _at(capture: Capture, across: float, down: float) -> Capture:
+    """All principal points at these shares of the images' sizes."""
+    K = capture.cameras.intrinsics.clone()
+    K[:, 0, 2], K[:, 1, 2] = across * capture.cameras.width, down * capture.cameras.height
+    return replace(capture, cameras=replace(capture.cameras, intrinsics=K))
+
+
+@pytest.mark.parametrize("brief", [False, True])
+@pytest.mark.parametrize("views", [3, 4, 6, 9])
+@pytest.mark.parametrize("where", [(0.001, 0.001), (0.2, 0.5), (0.5, 0.9)])
+def test_principal_points_beside_the_middle_are_named_and_no_view_is_blamed(captures, views, where, brief):
+    found = examine(_at(captures("built-in", views), *where), brief=brief)
+    assert [(f.kind, f.views) for f in found.findings] == [("principal", ())]
+    assert f"{where[0]:.0%} of the images' width" in found.findings[0].what
+    assert (
+        (found.findings[0].sure == "certain") == ("normalised" in found.findings[0].todo) == (where[1] < 0.01)
+    )
+
+
+def test_a_crop_beside_the_middle_is_no_fault():
+    """Principal points may lie anywhere when the pixels do."""
+    cameras = ring(6)
+    masks = box_masks(cameras, *BOX)
+    width = int(cameras.width[0])
+    K = cameras.intrinsics.clone()
+    K[:, 0, 2] += 2 * width
+    wide = replace(cameras, intrinsics=K, width=cameras.width + 2 * width)
+    padded = [torch.nn.functional.pad(m, (2 * width, 0)) for m in masks]
+    assert check(cameras, masks).findings == check(wide, padded).findings == []
+
+
+def test_fewer_than_two_views_are_a_finding(captures):
+    capture = captures("built-in", 4)
+    for count in (0, 1):
+        found = check(
+            capture.cameras[:count], capture.masks[:count], capture.images[:count], capture.names[:count]
+        )
+        assert [(f.kind, len(f.views)) for f in found.findings] == [("few", count)]
+
+
 @pytest.mark.parametrize(
     "fault", ["inverted", "empty", "opengl", "turned", "half_mask", "same_view", "wrong_size"]
 )

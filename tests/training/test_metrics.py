@@ -159,3 +159,20 @@ def test_ignored_pixels_are_not_measured():
     mean = (10 * 10 ** (-cut["psnr"] / 10) + 16 * 10 ** (-rest["psnr"] / 10)) / 26
     assert only["psnr"] == pytest.approx(-10 * math.log10(mean))
     assert all(math.isnan(v) for v in metrics.compare(rgb, alpha, image, mask, ignore=ignore | True).values())
+
+
+def test_ssim_with_ignored_pixels_charges_the_others_with_all_that_differs():
+    from visdom_plugin.ssim import ssim
+
+    torch.manual_seed(3)
+    image = (torch.rand(40, 48, 3) * 255).to(torch.uint8)
+    rgb, alpha, mask = torch.rand(40, 48, 3), torch.ones(40, 48), torch.ones(40, 48, dtype=torch.bool)
+    ignore = torch.zeros(40, 48, dtype=torch.bool)
+    ignore[:, 30:] = True
+    found = metrics.compare(rgb, alpha, image, mask, ignore=ignore)["ssim"]
+    x, y = (
+        torch.where(ignore[..., None], 1.0, z)
+        for z in (metrics.quantise(rgb), metrics.quantise(metrics.whiten(image, mask)))
+    )
+    whole = float(ssim(x.float(), y.float()))
+    assert found == pytest.approx(1 - (1 - whole) * 48 / 30, abs=1e-9) and found < whole

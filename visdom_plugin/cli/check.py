@@ -90,7 +90,8 @@ def _main(argv: Sequence[str]) -> int:
         _show(report, options)
         return FOUND
     loaded = time.perf_counter()
-    found = check_views(views, masks, k=None if options.k == "auto" else options.k)
+    k = None if options.k == "auto" else options.k
+    found = check_views(views, masks, k=k, layout=scene.source.get("layout"))
     report = _report(scene, views, found)
     report["seconds"] = {
         "load": round(loaded - started, 3),
@@ -115,7 +116,7 @@ def warn_of_faults(scene: Scene) -> None:
 
     log = logging.getLogger(__name__)
     views, masks = carving_views(scene.train)
-    for f in check_views(views, masks, brief=True).findings:
+    for f in check_views(views, masks, brief=True, layout=scene.source.get("layout")).findings:
         log.warning("%s (%s); what to do: %s; `visdom-check` tells more", f.what, f.sure, f.todo)
 
 
@@ -131,11 +132,15 @@ def carving_views(views: Views) -> tuple[Views, list]:
     return Views(cameras, images, masks, names), masks
 
 
-def check_views(views: Views, masks: Sequence, *, k: int | None = None, brief: bool = False) -> Check:
-    """`hull.check.check` of a scene's views."""
+def check_views(
+    views: Views, masks: Sequence, *, k: int | None = None, brief: bool = False, layout: str | None = None
+) -> Check:
+    """`hull.check.check` of a scene's views; `layout` is that of a scene on disk."""
+    from visdom_plugin.cli.pose_faults import pose_faults
     from visdom_plugin.hull.check import check
 
-    return check(views.cameras, masks, () if brief else views.images, views.names, k=k, brief=brief)
+    images = () if brief else views.images
+    return check(views.cameras, masks, images, views.names, k=k, brief=brief, poses=pose_faults(layout))
 
 
 def _report(scene: Scene, views: Views, found: Check) -> dict[str, Any]:

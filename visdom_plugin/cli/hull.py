@@ -105,14 +105,15 @@ def _main(argv: Sequence[str]) -> None:
         raise ConfigError(f"--frames is {options.frames}; it must be at least 1")
     from visdom_plugin.cli.scenes import open_scene
 
+    masks = None
+    if options.masks_out is not None:
+        masks = MaskRequest(options.masks_out, options.cameras, options.frames, options.overwrite)
     scene = open_scene(
         options.folder or options.data,
         **read_options(options),
         fill=False,
+        test=masks is not None and masks.cameras == "test",
     )
-    masks = None
-    if options.masks_out is not None:
-        masks = MaskRequest(options.masks_out, options.cameras, options.frames, options.overwrite)
     report = report_hull(domain, scene, out=options.out, diagnosing=options.diagnose, masks=masks)
     if options.json:
         sys.stdout.write(json.dumps(report) + "\n")

@@ -13,15 +13,19 @@ from visdom_plugin.cameras import Cameras, look_at_point
 from visdom_plugin.hull.coherence import Coherence, measure_coherence
 from visdom_plugin.hull.covisibility import LOST, USUAL_K, Advice, advise_k, measure_spread
 from visdom_plugin.hull.diagnose import look_inverted
+from visdom_plugin.hull.empty import ways_to_set_k
 from visdom_plugin.hull.findings import Finding, Name
 from visdom_plugin.hull.maskfaults import check_border, check_content, check_sizes, find_repeated
 from visdom_plugin.hull.outlines import OBJECT_PX, Outlines, draw_outlines
+from visdom_plugin.hull.poses import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.suspects import QUIET_PX, Suspicion, explain
 from visdom_plugin.hull.votes import gather_silhouettes
 
 CLUSTERED_DEGREES = 60.0
 """Views within this angle leave a hull more than 1.7 times as deep as the object."""
 _DISAGREE_PX, _SPEAKING_PX = 0.1, 0.5
+_MIDDLE = 0.25
+"""Principal points further than this from the images' centres, in image sizes, are outside their middle half."""
 _RAYS, _BRIEF_VIEWS = 1024, 16
 
 
@@ -49,6 +53,7 @@ def check(
     *,
     k: int | None = None,
     brief: bool = False,
+    poses: PoseFaults = IN_MEMORY,
 ) -> Check:
     """Looks for every fault that shows in cameras and masks, and for photographs that occur twice.
 
@@ -59,6 +64,7 @@ def check(
         names: the views' names, for the sentences.
         k: the K that is going to be used; by default it is to be advised.
         brief: a fraction of a second; names a fault but not always its cause, and compares 16 views at most.
+        poses: what to say of wrong poses, in the terms of where they are from.
     """
     masks = [np.asarray(m.detach().cpu() if hasattr(m, "detach") else m).astype(bool) for m in masks]
     names = Name([f"view {i}" for i in range(len(masks))] if names is None else names)
@@ -76,6 +82,8 @@ def check(
     repeated = _repeated(masks, images, out, names)
     if brief and len(usable) > _BRIEF_VIEWS:
         usable = usable[np.arange(_BRIEF_VIEWS) * len(usable) // _BRIEF_VIEWS]
+    if len(masks) < 2:
+        found.append(_too_few(len(masks)))
     if len(usable) < 2:
         notes, found = _split([*found, *repeated])
         return Check(found, notes, None, None, tuple(usable.tolist()))
@@ -85,10 +93,14 @@ def check(
     found += inverted
     turned = {v for f in inverted for v in f.views}
     found += check_border([m if i not in turned else ~m for i, m in enumerate(masks)], names)
-    causes, fit, left = explain(outlines, brief=brief)
+    causes, fit, left = explain(outlines, brief=brief, poses=poses)
+    astray = _astray(chosen)
+    if astray and _views_alone(causes, fit):
+        notes, found = _split([*found, *repeated, astray])
+        return Check(found, notes, None, fit, tuple(usable.tolist()))
     repeated, causes = _join(repeated, causes, usable, names)
     found += repeated
-    found += [_cause(c, usable, names, fit) for c in causes]
+    found += [_cause(c, usable, names, poses) for c in causes]
     ambiguous = any(c.rivals for c in causes)
     if fit.score > _DISAGREE_PX and not ambiguous:
         found.append(_disagreement(fit, usable[left], names))
@@ -106,6 +118,18 @@ def check(
 
 def _split(found: list[Finding]) -> tuple[list[Finding], list[Finding]]:
     return [f for f in found if f.note], [f for f in found if not f.note]
+
+
+def _too_few(count: int) -> Finding:
+    return Finding(
+        "few",
+        f"there is {'one view' if count else 'no view'} with a mask: nothing says how deep the object is, and no "
+        "hull can be carved",
+        tuple(range(count)),
+        "certain",
+        count,
+        "use more views: --views 3 or more",
+    )
 
 
 def _repeated(masks, images, out: set[int], names: Name) -> list[Finding]:
@@ -157,6 +181,35 @@ def _inverted(outlines: Outlines, masks, usable: np.ndarray, names: Name):
     return [said], turned
 
 
+def _astray(cameras: Cameras) -> Finding | None:
+    """Principal points outside the middle half of most images."""
+    K = cameras.intrinsics.double().cpu().numpy()
+    points = K[:, :2, 2]
+    shares = points / torch.stack([cameras.width, cameras.height], -1).cpu().numpy()
+    out = np.abs(shares - 0.5).max(1) > _MIDDLE
+    if 2 * out.sum() <= len(out):
+        return None
+    (x, y), (across, down) = np.median(points, 0), np.median(shares, 0)
+    normalised = bool((points <= 1).all(1).mean() > 0.5)
+    return Finding(
+        "principal",
+        f"the principal points (cx, cy) lie at ({x:.4g}, {y:.4g}) pixels, {across:.0%} of the images' width and "
+        f"{down:.0%} of their height, and the views do not fit together",
+        (),
+        "certain" if normalised else "likely",
+        float(out.mean()),
+        "multiply cx by the width and cy by the height: they are normalised"
+        if normalised
+        else "give cx and cy in pixels from the image's upper left corner, and scale them with the images",
+    )
+
+
+def _views_alone(causes: list[Suspicion], fit: Coherence) -> bool:
+    """Whether something is wrong, and nothing but single views is there to blame."""
+    wrong = bool(causes) or fit.score > _DISAGREE_PX or fit.power < _SPEAKING_PX
+    return wrong and all(c.kind == "view" for c in causes)
+
+
 def _join(repeated: list[Finding], causes: list[Suspicion], usable, names: Name):
     """A view that does not fit because it has another's mask is one fault, not two."""
     pairs = {view: k for k, f in enumerate(repeated) for view in f.views}
@@ -180,7 +233,6 @@ def _share(px: float) -> str:
 
 
 _TODO = {
-    "axes": 'hand the poses over in their own convention: convention="opengl", or the inverse matrices',
     "scale": "scale the intrinsics with the images: a photograph resized by s has s times the focal length and "
     "principal point",
     "order": "check how images, masks and poses are matched: sort them by the same key",
@@ -189,7 +241,7 @@ _TODO = {
 }
 
 
-def _cause(cause: Suspicion, usable: np.ndarray, names: Name, fit: Coherence) -> Finding:
+def _cause(cause: Suspicion, usable: np.ndarray, names: Name, poses: PoseFaults) -> Finding:
     views = tuple(int(usable[v]) for v in cause.views)
     gain = (
         f"undone, masks and cameras miss each other by {_share(cause.after)} of the object's length in the "
@@ -219,8 +271,9 @@ def _cause(cause: Suspicion, usable: np.ndarray, names: Name, fit: Coherence) ->
     ratio = min(cause.after / max(cause.before, 1e-9), 1.0)
     sure = "certain" if cause.before > _DISAGREE_PX and ratio < 0.1 else "likely"
     sure = "possible" if cause.rivals or cause.others else sure
+    todo = dict(poses)[cause.detail] if cause.kind == "axes" else _TODO[cause.kind]
     alternatives = tuple(sorted({kind for kind, _, _ in cause.others}))
-    return Finding(cause.kind, f"{what}: {gain}", views, sure, 1 - ratio, _TODO[cause.kind], alternatives)
+    return Finding(cause.kind, f"{what}: {gain}", views, sure, 1 - ratio, todo, alternatives)
 
 
 def _disagreement(fit: Coherence, views: np.ndarray, names: Name) -> Finding:
@@ -254,7 +307,7 @@ def _covisibility(advice: Advice, views: np.ndarray, asked: int | None) -> list[
             tuple(int(v) for v in views[lost > LOST]),
             "certain",
             float(lost.max()),
-            f'use -k {advice.k} or k="auto", or views that show more of the object in common',
+            f'use {ways_to_set_k(advice.k)} or k="auto", or views that show more of the object in common',
             note=asked is None and advice.k > 1,
         )
     ]

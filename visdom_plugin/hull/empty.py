@@ -57,6 +57,11 @@ def _list(views: Sequence[int]) -> str:
     return f"view {shown}" if len(views) == 1 else f"views {shown}"
 
 
+def ways_to_set_k(k: int) -> str:
+    """How K is set, wherever the hull is asked for."""
+    return f"K = {k} (visdom-hull -k {k}, visdom-train --method.hull.k {k}, VisibleDomain(k={k}))"
+
+
 def _try(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes) -> float:
     """Mean share that a coarse hull covers of the masks of the views that see it, 0 without one."""
     hull = carve_silhouettes(replace(domain, resolution=COARSE), cameras, silhouettes, effort=_EFFORT)
@@ -83,7 +88,7 @@ def _too_few_views(domain, cameras, silhouettes):
     if k <= len(silhouettes):
         return None
     cause = f"K = {k} is larger than co-visibility allows: there are only {len(silhouettes)} views"
-    return cause, f"use more views, or -k {min(3, len(silhouettes))} or less", None
+    return cause, f"use more views, or {ways_to_set_k(min(3, len(silhouettes)))} or less", None
 
 
 def _beside(domain, cameras, silhouettes):
@@ -141,7 +146,10 @@ def _convention(domain, cameras, silhouettes):
     if scores[best] < _CONVINCING:
         return None
     cause, _, todo = trials[best][1].partition(": ")
-    return f"{cause}; read so, the hull covers {scores[best]:.0%} of the masks", todo, "camera poses"
+    # A reader turns a file's poses into those of Cameras: which of the two is at fault is not seen here.
+    cause = f"as they reach the hull, {cause}; read so, the hull covers {scores[best]:.0%} of the masks"
+    todo += "; of a scene on disk, `visdom-check DIR` tells what its file holds wrongly"
+    return cause, todo, "camera poses"
 
 
 def _covisibility(domain, cameras, silhouettes):
@@ -151,7 +159,7 @@ def _covisibility(domain, cameras, silhouettes):
     for fewer in range(k - 1, 0, -1):
         if _try(replace(domain, k=fewer), cameras, silhouettes) >= _CONVINCING:
             cause = f"K = {k} is larger than co-visibility: too little is seen by more than {fewer}"
-            return cause, f"use -k {fewer}, or views that see more of the object in common", "k"
+            return cause, f"use {ways_to_set_k(fewer)}, or views that see more of the object in common", "k"
     return None
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from visdom_plugin.hull.coherence import Coherence, measure_coherence
 from visdom_plugin.hull.outlines import Outlines
+from visdom_plugin.hull.poses import IN_MEMORY, PoseFaults
 
 QUIET_PX = 0.015
 """Mean residual (in pixels of the fields, an object is 128 long) below which nothing is looked for: sound captures
@@ -60,12 +61,15 @@ class _Trial(NamedTuple):
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
-def explain(outlines: Outlines, *, brief: bool = False) -> tuple[list[Suspicion], Coherence, np.ndarray]:
+def explain(
+    outlines: Outlines, *, brief: bool = False, poses: PoseFaults = IN_MEMORY
+) -> tuple[list[Suspicion], Coherence, np.ndarray]:
     """Looks for causes until the rest fits together.
 
     Args:
         outlines: two views or more, none empty.
         brief: try only wrong axes and single views, with few rays.
+        poses: what to say of wrong poses.
 
     Returns:
         The causes, most serious first; the coherence of what is left; and which views are left (N,) bool. When
@@ -79,7 +83,7 @@ def explain(outlines: Outlines, *, brief: bool = False) -> tuple[list[Suspicion]
         if left.sum() < 2 or (fit.score <= QUIET_PX and (fit.power >= _LEAST_POWER_PX or left.sum() < 3)):
             break
         index = np.flatnonzero(left)
-        cause, changed, stays = _best_cause(outlines.keep(index), fit, rays, brief)
+        cause, changed, stays = _best_cause(outlines.keep(index), fit, rays, brief, poses)
         if cause is None:
             pair = _two_views(outlines.keep(index), fit, rays) if fit.score > QUIET_PX else None
             if pair is None:
@@ -103,7 +107,7 @@ def explain(outlines: Outlines, *, brief: bool = False) -> tuple[list[Suspicion]
     return found, fit, left
 
 
-def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool):
+def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool, poses: PoseFaults):
     """The cause that explains most, the changed outlines and the views that stay; (None, ...) for none."""
     count, before = len(outlines), fit.score
     silent = before <= QUIET_PX
@@ -112,7 +116,7 @@ def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool):
     alone = np.array([fit.score_without(i) for i in range(count)]) if count >= 3 else np.full(count, np.inf)
     culprit = int(np.argmin(alone))
     tried = []
-    for trial in _whole_trials(count, alone, fit, brief):
+    for trial in _whole_trials(count, alone, fit, brief, poses):
         changed = trial.change(outlines)
         # Where masks are silent the principal points must speak: any longer lens makes views more selective.
         if silent and not (_off_centre(outlines) > _FAR_OFF and _off_centre(changed) < _FAR_OFF / 2):
@@ -153,7 +157,7 @@ def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool):
     close = alone <= max(2 * alone[culprit], alone[culprit] + _FLOOR_PX)
     rivals = tuple(int(i) for i in np.flatnonzero(close) if i != culprit)
     stays[culprit] = False
-    detail = "" if rivals or brief else _explain_view(outlines, culprit, rays, fit)
+    detail = "" if rivals or brief else _explain_view(outlines, culprit, rays, fit, poses)
     return Suspicion("view", (culprit,), detail, before, float(alone[culprit]), rivals), outlines, stays
 
 
@@ -179,11 +183,13 @@ def _two_views(outlines: Outlines, fit: Coherence, rays: int) -> tuple[tuple[int
     return (views, after) if clear else None
 
 
-def _whole_trials(count: int, alone: np.ndarray, fit: Coherence, brief: bool) -> Iterator[_Trial]:
+def _whole_trials(
+    count: int, alone: np.ndarray, fit: Coherence, brief: bool, poses: PoseFaults
+) -> Iterator[_Trial]:
     """Causes that keep every view."""
     everyone: tuple[int, ...] = ()
-    for detail, change in _AXES:
-        yield _Trial("axes", everyone, detail, change)
+    for fault, change in zip(poses, _AXES, strict=True):
+        yield _Trial("axes", everyone, fault.what, change)
     if brief:
         return
     for scale in _SCALES:
@@ -213,7 +219,7 @@ def _whole_trials(count: int, alone: np.ndarray, fit: Coherence, brief: bool) ->
         yield _Trial("swapped", (a, b), "their masks fit when exchanged", lambda o, p=order: _ordered(o, p))
 
 
-def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence) -> str:
+def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence, poses: PoseFaults) -> str:
     """What would mend one view, or nothing."""
 
     def one(change):
@@ -227,7 +233,7 @@ def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence) -> s
             fields,
         )
 
-    trials = [(detail, change) for detail, change in _AXES]
+    trials = [(fault.what, change) for fault, change in zip(poses, _AXES, strict=True)]
     trials += [
         (
             f"its focal length is {1 / s:.3g} times what it should be",
@@ -268,12 +274,13 @@ def _inverse(outlines: Outlines) -> Outlines:
     )
 
 
-_AXES: tuple[tuple[str, Callable[[Outlines], Outlines]], ...] = (
-    ("the poses have OpenGL axes (y up, z backward)", lambda o: _turned(o, _FLIP)),
-    ("the poses are world-to-camera matrices", _inverse),
-    ("the poses are world-to-camera matrices with OpenGL axes", lambda o: _turned(_inverse(o), _FLIP)),
-    ("the poses are inverted OpenGL matrices", lambda o: _inverse(_turned(_inverse(o), _FLIP))),
+_AXES: tuple[Callable[[Outlines], Outlines], ...] = (
+    lambda o: _turned(o, _FLIP),
+    _inverse,
+    lambda o: _turned(_inverse(o), _FLIP),
+    lambda o: _inverse(_turned(_inverse(o), _FLIP)),
 )
+"""What undoes each of `PoseFaults`, in their order."""
 
 
 def _scaled(outlines: Outlines, factor: float, whole: bool) -> Outlines:

@@ -99,7 +99,8 @@ def compare(
         hull_silhouette: (H, W) bool, the reference hull seen by this camera.
         perceptual: the network of `load_lpips`.
         ignore: (H, W) bool, pixels that count for nothing; None where all count. SSIM and LPIPS see them white
-            in both pictures; SSIM's mean is over the others.
+            in both pictures. SSIM is 1 - (1 - S) / share, with S its mean over the whole frame and `share` that of
+            the pixels that count: their mean, less what ignored pixels lose whose windows reach among them.
 
     Returns:
         A dict with the keys `NAMES`; NaN where a metric does not apply.
