@@ -116,8 +116,8 @@ def _open_noted(path: Path | None, noted: dict[str, Any], run: Path, test: bool)
 
 def _list_views(train: Sequence[str], test: Sequence[str]) -> dict[str, Any]:
     """Options on reading that ask for views by name."""
-    if any("," in name for name in (*train, *test)):
-        # Such names cannot be listed; the lists of then are asked, and the hashes tell.
+    if any("," in name or name.isdecimal() for name in (*train, *test)):
+        # Such names cannot be listed, or could be positions; the lists of then are asked, and the hashes tell.
         return {}
     # A comma after the last name, so that a single one is not taken for the name of a list.
     train_list, test_list = ("".join(f"{name}," for name in names) or None for names in (train, test))
