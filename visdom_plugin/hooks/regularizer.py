@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.cameras import Cameras, interpolate
+from visdom_plugin.cameras import Cameras, interpolate, require_batch
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.paint import colour_points
@@ -92,7 +92,8 @@ class VisDomGaussianRegularizer:
         prune_every: int = 0,
         prune_margin_voxels: float = 2.0,
     ):
-        if cameras.shape == () or len(cameras) < 2:
+        require_batch(cameras, "VisDomGaussianRegularizer")
+        if len(cameras) < 2:
             raise ConfigError(
                 "VisDomGaussianRegularizer needs at least two training cameras to interpolate between",
                 todo="pass the batch of all training cameras",
