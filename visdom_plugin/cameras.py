@@ -217,7 +217,7 @@ def _check(cameras: Cameras) -> None:
     if bad.any():
         raise SceneError(
             f"the last row of world_from_camera of {_which(bad)} is {_row(last, bad)}, not (0, 0, 0, 1)",
-            cause="a transposed matrix: the position belongs in the last column",
+            cause="a transposed matrix, whose position stands in its last row, or a scaled one",
             todo="pass matrices that map columns, [R t; 0 0 0 1]: transpose them back",
         )
     K = cameras.intrinsics
