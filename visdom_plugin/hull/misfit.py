@@ -21,7 +21,7 @@ from visdom_plugin.hull.votes import Silhouettes
 
 log = logging.getLogger(__name__)
 
-_POOR = 0.75
+_POOR = 0.7
 """Mean share of the masks below which a hull does not explain them."""
 _SPECK = 1e-3
 """Of the cameras' distance: a hull smaller than this is no object that a camera was pointed at."""
