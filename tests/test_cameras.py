@@ -111,14 +111,29 @@ def test_orbit_looks_at_the_object_from_one_distance():
     assert len(circle) == 12
 
 
+def skewed(K, row: int, column: int):
+    K = K.copy()
+    K[row, column] = K[0, 0]
+    return K
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda K, T: (K * np.nan, T), "NaN"),
         (lambda K, T: (K, T * 2), "not a rotation"),
         (lambda K, T: (K, T * [1, 1, -1, 1]), "not a rotation"),
-        (lambda K, T: (-K, T), "positive focal"),
+        (lambda K, T: (K * [[1], [-1], [1]], T), "positive focal"),
         (lambda K, T: (K[:2], T), "shapes"),
+        (
+            lambda K, T: (K, T.swapaxes(1, 2)),
+            r"last row of world_from_camera of cameras 0, 1, 2.*\n.*transposed",
+        ),
+        (lambda K, T: (K.T, T), r"last row of the intrinsics.*52\.5"),
+        (lambda K, T: (K * [[1], [1], [-1]], T), "last row of the intrinsics"),
+        (lambda K, T: (skewed(K, 1, 0), T), "no skew"),
+        (lambda K, T: (skewed(K, 0, 1), T), "no skew"),
+        (lambda K, T: (np.stack([K, K]), T), r"shape \(2,\).*\(3,\)"),
     ],
 )
 def test_bad_matrices_are_named(change, words):
@@ -126,6 +141,56 @@ def test_bad_matrices_are_named(change, words):
     K, T = change(cameras.intrinsics[0].numpy(), cameras.world_from_camera.numpy())
     with pytest.raises(SceneError, match=words):
         Cameras.from_matrices(K, T, width=100, height=80)
+
+
+def test_the_one_transposed_matrix_is_named():
+    cameras = ring(3)
+    motion = cameras.world_from_camera.clone()
+    motion[1] = motion[1].mT.clone()
+    with pytest.raises(SceneError, match=r"of camera 1 is \("):
+        Cameras.from_matrices(cameras.intrinsics, motion, width=100, height=80)
+
+
+@given(st.integers(0, 2), st.integers(0, 2), st.floats(1e-3, 1e3), st.booleans())
+@settings(max_examples=60, deadline=None)
+def test_accepted_intrinsics_leave_project_and_rays_of_each_others_inverse(row, column, change, minus):
+    # Whatever entry of K is changed: either it is refused, or rays still project to where they came from.
+    cameras = ring(2)
+    K = cameras.intrinsics.clone()
+    K[:, row, column] += -change if minus else change
+    try:
+        cameras = Cameras.from_matrices(K, cameras.world_from_camera, width=100, height=80)
+    except SceneError:
+        return
+    uv = torch.rand(2, 5, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 80
+    rays = rays_of(cameras, uv)
+    again, _ = project(cameras, rays.origins + 2.5 * rays.directions)
+    assert torch.allclose(again, uv, atol=1e-3)
+
+
+def test_sizes_that_do_not_match_the_cameras_are_named():
+    cameras = ring(4)
+    with pytest.raises(SceneError, match=r"width has shape \(2,\) for cameras of shape \(4,\)"):
+        Cameras.from_matrices(cameras.intrinsics, cameras.world_from_camera, width=[48, 48], height=[48] * 4)
+    with pytest.raises(SceneError, match="height has shape"):
+        cameras.resized(48, [48] * 3)
+
+
+def test_only_one_batch_of_cameras_will_do():
+    from visdom_plugin.hooks.regularizer import VisDomGaussianRegularizer
+    from visdom_plugin.hull.domain import VisibleDomain
+    from visdom_plugin.hull.hull import Hull
+
+    cameras = ring(3)
+    singles = [cameras[i] for i in range(3)]
+    masks = [torch.ones(80, 100, dtype=torch.bool)] * 3
+    hull = Hull.from_grid(np.ones((2, 2, 2)), [[-1] * 3, [1] * 3])
+    for wrong, words in ((singles, r"Cameras\.stack"), (cameras[0], "cameras\\[None\\]"), (None, "NoneType")):
+        with pytest.raises(SceneError, match=words):
+            VisibleDomain(resolution=8).carve(wrong, masks)
+        with pytest.raises(SceneError, match=words):
+            VisDomGaussianRegularizer(hull, wrong)
+    assert len(VisDomGaussianRegularizer(hull, Cameras.stack(singles)).cameras) == 3
 
 
 def test_unknown_convention_lists_the_known_ones():

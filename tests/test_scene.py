@@ -11,8 +11,7 @@ def make_views(**fields):
     n = 4
     cameras = Cameras.from_matrices(
         torch.tensor([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]).repeat(n, 1, 1),
-        torch.eye(4).repeat(n, 1, 1)
-        + torch.arange(n)[:, None, None] * torch.tensor([0, 0, 0, 1.0]) * torch.eye(4),
+        torch.eye(4).repeat(n, 1, 1),
         width=8,
         height=6,
     )

@@ -58,8 +58,9 @@ class Cameras:
             integers), on their device, outside any graph.
 
         Raises:
-            SceneError: for NaN or infinite numbers, a rotation part that is not a rotation, a skewed or
-                non-positive focal length, an empty image, or an unknown convention.
+            SceneError: for NaN or infinite numbers; a last row of a motion other than (0, 0, 0, 1), or of K other
+                than (0, 0, 1), as transposed matrices have them; a rotation part that is not a rotation; a skewed
+                or non-positive focal length; an empty image; an unknown convention; or counts that do not match.
         """
         motion = _as_tensor(world_from_camera)
         motion = motion if motion.is_floating_point() else motion.double()
@@ -80,10 +81,15 @@ class Cameras:
             motion = torch.cat([motion, last], -2)
         if convention == "opengl":
             motion = motion * motion.new_tensor([1.0, -1.0, -1.0, 1.0])
-        batch = torch.broadcast_shapes(intrinsics.shape[:-2], motion.shape[:-2])
-        size = [
-            torch.as_tensor(x, device=motion.device).to(torch.int64).expand(batch) for x in (width, height)
-        ]
+        try:
+            batch = torch.broadcast_shapes(intrinsics.shape[:-2], motion.shape[:-2])
+        except RuntimeError as error:
+            raise SceneError(
+                f"K is for cameras of shape {tuple(intrinsics.shape[:-2])}, "
+                f"world_from_camera for {tuple(motion.shape[:-2])}",
+                todo="pass one K per camera, or one (3, 3) for all",
+            ) from error
+        size = _sizes(batch, motion.device, width=width, height=height)
         cameras = cls(intrinsics.expand(*batch, 3, 3), motion.expand(*batch, 4, 4), *size)
         _check(cameras)
         return cameras
@@ -135,8 +141,7 @@ class Cameras:
 
     def resized(self, width, height) -> Cameras:
         """Cameras whose images were resampled to another size, each axis by its own ratio."""
-        width = torch.as_tensor(width, device=self.width.device).to(torch.int64).expand(self.shape)
-        height = torch.as_tensor(height, device=self.width.device).to(torch.int64).expand(self.shape)
+        width, height = _sizes(self.shape, self.width.device, width=width, height=height)
         sizes = (width.double() / self.width, height.double() / self.height)
         ratio = torch.stack([*sizes, torch.ones_like(sizes[0])], -1)
         return Cameras(
@@ -150,6 +155,43 @@ def _as_tensor(value) -> Tensor:
     if isinstance(value, np.ndarray):
         value = np.ascontiguousarray(value)  # torch knows no negative strides
     return torch.as_tensor(value).detach()
+
+
+def _sizes(batch: torch.Size, device, **sizes) -> list[Tensor]:
+    """Each of the named sizes as int64 of shape `batch`."""
+    found = []
+    for name, value in sizes.items():
+        value = torch.as_tensor(value, device=device).to(torch.int64)
+        try:
+            found.append(value.expand(batch))
+        except RuntimeError as error:
+            raise SceneError(
+                f"{name} has shape {tuple(value.shape)} for cameras of shape {tuple(batch)}",
+                todo=f"pass one {name} for all cameras, or one per camera",
+            ) from error
+    return found
+
+
+def require_batch(cameras, where: str) -> None:
+    """Refuses anything but a batch (N,) of one camera or more.
+
+    Raises:
+        SceneError: for a sequence of single cameras, a single camera, an empty or a deeper batch.
+    """
+    if not isinstance(cameras, Cameras):
+        several = isinstance(cameras, Sequence) and all(isinstance(c, Cameras) for c in cameras)
+        kind = f"{type(cameras).__name__} of {len(cameras)} Cameras" if several else type(cameras).__name__
+        raise SceneError(
+            f"cameras are a {kind}, not one batch Cameras of shape (N,)",
+            where=where,
+            todo="join single cameras with Cameras.stack(list), or make them with Cameras.from_matrices",
+        )
+    if len(cameras.shape) != 1 or len(cameras) == 0:
+        raise SceneError(
+            f"cameras have shape {tuple(cameras.shape)}, not (N,) with N of 1 or more",
+            where=where,
+            todo="pass the batch of all cameras; cameras[None] is a batch of a single one",
+        )
 
 
 def _check(cameras: Cameras) -> None:
@@ -170,16 +212,35 @@ def _check(cameras: Cameras) -> None:
             cause="a scaled or mirrored pose, or a matrix in row-major order taken for column-major",
             todo="remove scale and reflection; pass camera-to-world matrices",
         )
-    K = cameras.intrinsics
-    bad = (K[..., 0, 0] <= 0) | (K[..., 1, 1] <= 0) | (K[..., 0, 1].abs() > 1e-6 * K[..., 0, 0].abs())
+    last = cameras.world_from_camera[..., 3, :]
+    bad = ((last - last.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() > 1e-6).any(-1)
     if bad.any():
         raise SceneError(
-            f"intrinsics of {_which(bad)} need positive focal lengths and no skew",
-            todo="pass [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
+            f"the last row of world_from_camera of {_which(bad)} is {_row(last, bad)}, not (0, 0, 0, 1)",
+            cause="a transposed matrix, whose position stands in its last row, or a scaled one",
+            todo="pass matrices that map columns, [R t; 0 0 0 1]: transpose them back",
         )
+    K = cameras.intrinsics
+    form = "pass [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+    last = K[..., 2, :]
+    bad = ((last - last.new_tensor([0.0, 0.0, 1.0])).abs() > 1e-6).any(-1)
+    if bad.any():
+        raise SceneError(
+            f"the last row of the intrinsics of {_which(bad)} is {_row(last, bad)}, not (0, 0, 1)",
+            cause="a transposed matrix, or one that is scaled or has the axes of another convention",
+            todo=form,
+        )
+    skew = torch.maximum(K[..., 0, 1].abs(), K[..., 1, 0].abs())
+    bad = (K[..., 0, 0] <= 0) | (K[..., 1, 1] <= 0) | (skew > 1e-6 * K[..., 0, 0].abs())
+    if bad.any():
+        raise SceneError(f"intrinsics of {_which(bad)} need positive focal lengths and no skew", todo=form)
     bad = (cameras.width <= 0) | (cameras.height <= 0)
     if bad.any():
         raise SceneError(f"width and height of {_which(bad)} must be positive")
+
+
+def _row(rows: Tensor, bad: Tensor) -> str:
+    return "(" + ", ".join(f"{x:.6g}" for x in rows[bad].reshape(-1, rows.shape[-1])[0].tolist()) + ")"
 
 
 def _which(bad: Tensor) -> str:

@@ -75,7 +75,7 @@ def initial(xyz):
 
 def in_a_box(hull):
     """gsplat's init_type="random": points all over a box around the object, most of them outside the hull."""
-    low, high = torch.from_numpy(hull.bounds).float()
+    low, high = torch.tensor(hull.bounds).float()
     return low + torch.rand(N, 3, generator=torch.Generator().manual_seed(0)) * (high - low)
 
 

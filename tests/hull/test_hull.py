@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from visdom_plugin.errors import CheckpointError, ConfigError, EmptyHullError
 from visdom_plugin.hull.components import choose_pieces, erase_pieces, find_pieces
 from visdom_plugin.hull.hull import Hull, write_whole
 from visdom_plugin.hull.mesh import is_closed, mesh_grid
+from visdom_plugin.hull.raycast import cast, march
 
 
 def ball(n: int = 40, radius: float = 0.7) -> Hull:
@@ -249,6 +251,47 @@ def test_pickle_and_deepcopy():
     hull.to_mesh()
     for other in (copy.deepcopy(hull), pickle.loads(pickle.dumps(hull))):
         assert other == hull and not other._derived
+
+
+def test_a_hull_cannot_be_changed(tmp_path):
+    made = ball(12)
+    made.save(tmp_path / "hull.npz")
+    np.savez(tmp_path / "foreign.npz", occupancy=made.occupancy, bounds=made.bounds)
+    own = Hull(made.occupancy.copy(), made.bounds.copy())
+    others = [Hull.load(tmp_path / name) for name in ("hull.npz", "foreign.npz")]
+    others += [copy.deepcopy(made), copy.copy(made), pickle.loads(pickle.dumps(made)), own]
+    for hull in (made, *others):
+        voxels, extent, centre = hull.voxels, hull.extent.copy(), hull.centre.copy()
+        for array in (hull.occupancy, hull.bounds, *hull.to_mesh()):
+            with pytest.raises(ValueError, match="read-only"):
+                array[:] = 0
+        hull.extent[:] = 0
+        hull.centre[:] = 9
+        assert np.array_equal(hull.extent, extent) and np.array_equal(hull.centre, centre)
+        assert hull.voxels == voxels == np.count_nonzero(hull.occupancy) and hull == made
+
+
+def test_a_giver_of_bounds_keeps_them():
+    box = np.array([[0.0, 0, 0], [1, 1, 1]])
+    hull = Hull(np.ones((2, 2, 2), bool), box)
+    box[:] = 7
+    assert hull.bounds.tolist() == [[0, 0, 0], [1, 1, 1]]
+
+
+def test_a_hull_with_something_replaced_knows_nothing_of_the_old_one():
+    hull = ball(12)
+    before = hull.centre
+    moved = replace(hull, bounds=hull.bounds + 1)
+    assert np.allclose(moved.centre, before + 1) and np.allclose(hull.centre, before)
+
+
+def test_torch_may_write_nothing_and_says_nothing(recwarn):
+    hull = ball(12)
+    points = torch.zeros(3, 3)
+    assert hull.contains(points).all() and hull.contains(points, margin_voxels=1).all()
+    assert march(hull, points, torch.eye(3)).hit.all() and cast(hull, points, torch.eye(3)).hit.all()
+    assert hull.sample_inside(4).shape == hull.sample_points(4).shape == (4, 3)
+    assert not [w for w in recwarn if "writable" in str(w.message)]
 
 
 @given(st.integers(0, 10**9), st.floats(0.02, 0.6))

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.cameras import Cameras, interpolate, project
+from visdom_plugin.cameras import Cameras, interpolate, project, require_batch
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.paint import check_images, colour_points
@@ -130,7 +130,8 @@ class VisDomGaussianRegularizer:
         prune_every: int = 0,
         prune_margin_voxels: float = 2.0,
     ):
-        if cameras.shape == () or len(cameras) < 2:
+        require_batch(cameras, "VisDomGaussianRegularizer")
+        if len(cameras) < 2:
             raise ConfigError(
                 "VisDomGaussianRegularizer needs at least two training cameras to interpolate between",
                 todo="pass the batch of all training cameras",

@@ -40,6 +40,7 @@ def carve(domain: VisibleDomain, cameras: Cameras, masks: Sequence) -> Hull:
     """See `VisibleDomain.carve`."""
     from visdom_plugin.hull.diagnose import choose_k, look_inverted
     from visdom_plugin.hull.empty import explain_empty
+    from visdom_plugin.hull.misfit import find_misfit
 
     log.info("carving the hull (the first time on a machine its kernels are compiled: 10 to 30 s)")
     silhouettes = gather_silhouettes(cameras, masks, domain.dilate_px)
@@ -51,7 +52,10 @@ def carve(domain: VisibleDomain, cameras: Cameras, masks: Sequence) -> Hull:
     if hull is None:
         raise explain_empty(domain, cameras, silhouettes)
     hull.summary["k_asked"] = asked
-    if not hull.summary["bounds_closed"]:
+    misfit = find_misfit(domain, cameras, silhouettes, hull)
+    if misfit is not None:
+        log.warning(misfit)
+    elif not hull.summary["bounds_closed"]:
         log.warning(
             "the views leave the hull open: it is cut off at %s .. %s; more views from other sides, a larger k or "
             "explicit bounds would close it",

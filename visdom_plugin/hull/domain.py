@@ -108,7 +108,8 @@ class VisibleDomain:
 
         Raises:
             EmptyHullError: when nothing is left, with the cause where it could be established.
-            SceneError: when masks and cameras do not fit each other.
+            SceneError: when masks and cameras do not fit each other: in number or size, or, with automatic bounds,
+                because the hull covers little of the masks and would cover them with poses of another convention.
         """
         from visdom_plugin.hull.carve import carve
 

@@ -38,7 +38,7 @@ def explain_empty(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouet
         _too_few_views,
         _inverted,
         _beside,
-        _convention,
+        find_convention,
         _covisibility,
         _single_view,
     ):
@@ -124,7 +124,8 @@ def _inverted(domain, cameras, silhouettes):
     return cause, "invert them: True (white) on the object", _list(flagged)
 
 
-def _convention(domain, cameras, silhouettes):
+def find_convention(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes):
+    """Cause, what to do and where, when the poses read in another convention explain the masks; or None."""
     flip = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
     motion = cameras.world_from_camera.double().cpu()
     inverse = cameras.camera_from_world.double().cpu()
@@ -133,7 +134,6 @@ def _convention(domain, cameras, silhouettes):
         (motion @ flip, f"the poses have OpenGL axes (y up, z backward): pass {gl} to Cameras.from_matrices"),
         (inverse, f"the poses are {w2c}: pass their inverses, world_from_camera"),
         (inverse @ flip, f"the poses are {w2c} with OpenGL axes: pass their inverses and {gl}"),
-        (flip @ motion, "the world's y and z axes are flipped: the poses are inverted OpenGL matrices"),
     ]
     scores = []
     for matrix, _ in trials:

@@ -25,15 +25,23 @@ _SCHEMA = 1
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """Voxels that may hold the object. Never changed after it is made."""
+    """Voxels that may hold the object. Never changed after it is made: its arrays are read-only.
+
+    The constructor takes the occupancy over without a copy, and makes it read-only for its giver, too; `from_grid`
+    copies.
+    """
 
     occupancy: np.ndarray
-    """(X, Y, Z) bool; voxel (0, 0, 0) lies at the lower corner."""
+    """(X, Y, Z) bool; voxel (0, 0, 0) lies at the lower corner. Read-only."""
     bounds: np.ndarray
-    """(2, 3) float64 lower and upper corner of the grid, world frame."""
+    """(2, 3) float64 lower and upper corner of the grid, world frame. Read-only."""
     summary: dict[str, Any] = field(default_factory=dict)
     """How it was carved: rule, views, seconds, components; plain numbers and strings."""
-    _derived: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self):
+        object.__setattr__(self, "bounds", np.array(self.bounds, np.float64))
+        _freeze(self.occupancy, self.bounds)
 
     @classmethod
     def from_grid(cls, array, bounds, summary: dict[str, Any] | None = None) -> Hull:
@@ -57,6 +65,10 @@ class Hull:
 
     def __getstate__(self):
         return self.__dict__ | {"_derived": {}}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state)
+        _freeze(self.occupancy, self.bounds)
 
     def _once(self, key, make: Callable[[], Any]) -> Any:
         if key not in self._derived:
@@ -104,12 +116,13 @@ class Hull:
     @property
     def extent(self) -> np.ndarray:
         """(2, 3) tight box around the occupied voxels, world frame; the grid's own box for an empty hull."""
-        return self._once("extent", lambda: self.bounds[0] + occupied_box(self.occupancy) * self.voxel_edges)
+        box = self._once("extent", lambda: self.bounds[0] + occupied_box(self.occupancy) * self.voxel_edges)
+        return box.copy()
 
     @property
     def centre(self) -> np.ndarray:
         """(3,) mean of the occupied voxels' centres, world frame; of the box for an empty hull."""
-        return self._once("centre", self._find_centre)
+        return self._once("centre", self._find_centre).copy()
 
     @property
     def radius(self) -> float:
@@ -154,9 +167,9 @@ class Hull:
 
     def _grid_on(self, device: torch.device, reach: int = 0) -> Tensor:
         def make():
-            grid = self.occupancy
+            # torch knows no read-only arrays, so the grid is copied even where it does not grow.
+            grid = np.pad(self.occupancy, reach)
             if reach:
-                grid = np.pad(grid, reach)
                 for axis in range(3):
                     row = np.moveaxis(grid, axis, 0)
                     grown = row.copy()
@@ -174,14 +187,15 @@ class Hull:
 
         Returns:
             Vertices (V, 3) float64, world frame, and faces (F, 3) int64: closed, outward (anticlockwise seen
-            from outside), every edge in exactly two faces.
+            from outside), every edge in exactly two faces. Both are read-only.
         """
 
         def make():
             lower, upper = occupied_box(self.occupancy).astype(int)
             window = tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))
-            vertices, faces = mesh_grid(self.occupancy[window])
-            return self.bounds[0] + (vertices + lower) * self.voxel_edges, faces
+            # A copy also where the window is the whole grid: its kernel is compiled for writable arrays.
+            vertices, faces = mesh_grid(self.occupancy[window].copy())
+            return _freeze(self.bounds[0] + (vertices + lower) * self.voxel_edges, faces)
 
         return self._once("mesh", make)
 
@@ -295,6 +309,12 @@ class Hull:
         write_whole(
             path, lambda f: f.write(header.encode() + vertices.astype("<f4").tobytes() + records.tobytes())
         )
+
+
+def _freeze(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays
 
 
 def write_whole(path: str | Path, write: Callable[[Any], Any]) -> None:

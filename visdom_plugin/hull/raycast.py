@@ -267,7 +267,7 @@ def _walk(hull: Hull, origins: Tensor, directions: Tensor, shape, *, both: bool)
     bricks = hull._once("bricks", lambda: build_bricks(hull.occupancy))
     first, last = np.empty(len(directions)), np.empty(len(directions))
     hit = np.empty(len(directions), np.bool_)
-    lower, scale = np.ascontiguousarray(hull.bounds[0]), 1 / hull.voxel_edges
+    lower, scale = np.array(hull.bounds[0]), 1 / hull.voxel_edges
     box = hull._once("box", lambda: occupied_box(hull.occupancy).astype(float))
     shaped = (np.array(bricks.bits.shape), bricks.bits.reshape(-1), bricks.ahead.reshape(-1))
     inputs = (origins, directions, lower, scale, box, *shaped, both)
@@ -282,7 +282,7 @@ def march(hull: Hull, origins: Tensor, directions: Tensor) -> Crossing:
     """
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
     device = directions.device
-    lower, edges = (torch.as_tensor(x, device=device) for x in (hull.bounds[0], hull.voxel_edges))
+    lower, edges = (torch.as_tensor(x, device=device) for x in (hull.bounds[0].copy(), hull.voxel_edges))
     o = ((origins.detach().double() - lower) / edges).expand(*shape, 3).reshape(-1, 3)
     d = (directions.detach().double() / edges).expand(*shape, 3).reshape(-1, 3)
     low, high = torch.as_tensor(occupied_box(hull.occupancy), device=device)

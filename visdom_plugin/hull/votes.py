@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from visdom_plugin.cameras import Cameras
+from visdom_plugin.cameras import Cameras, require_batch
 from visdom_plugin.errors import SceneError
 from visdom_plugin.hull.rule import KeepRule
 
@@ -82,9 +82,10 @@ def gather_silhouettes(cameras: Cameras, masks: Sequence, dilate_px: int = 0) ->
         dilate_px: grow each mask by a square of 2 * dilate_px + 1 pixels.
 
     Raises:
-        SceneError: when counts or sizes do not match, or a mask is not bool or 0/1.
+        SceneError: when cameras are no batch, counts or sizes do not match, or a mask is not bool or 0/1.
     """
-    if len(cameras.shape) != 1 or len(cameras) == 0 or len(masks) != len(cameras):
+    require_batch(cameras, "the cameras of the hull")
+    if len(masks) != len(cameras):
         raise SceneError(
             f"{len(masks)} masks for cameras of shape {tuple(cameras.shape)}",
             todo="pass one mask per camera: cameras (N,), masks N x (H, W)",
