@@ -58,8 +58,8 @@ class Common(Reading):
     missing_masks: Annotated[Literal["error", "colour", "hull"], tyro.conf.arg(name="data.missing-masks")] = (
         "error"
     )
-    """Views without a mask: an error; for colour only, inside the hull of the other views; or that hull's outline
-    becomes their mask."""
+    """Training views without a mask: an error; for colour only, inside the hull of the other views; or that hull's
+    outline becomes their mask. Test views without one are then rendered, not measured."""
     mask_source: Annotated[Literal["auto", "folder", "alpha"], tyro.conf.arg(name="data.mask-source")] = (
         "auto"
     )
