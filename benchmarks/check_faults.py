@@ -20,8 +20,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from datamodules import load
-from tests.hull.faults import FAULTS, Capture, capture_of, clustered, judge
-from visdom_plugin.hull.check import check
+from tests.hull.checks.faults import FAULTS, Capture, capture_of, clustered, judge
+from visdom_plugin.hull.checks.check import check
 
 REAL = ("blowtorch", "middlebury_temple", "mother_child", "studio_human", "synthetic_lego", "vgg_dinosaur")
 

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 
 from datamodules import load
-from visdom_plugin.cli.errors import run
+from visdom_plugin.cli.entry import run
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.figures.contact_sheet import draw_sheet, picture_names, to_bytes, write_png
 from visdom_plugin.training.metrics import whiten
-from visdom_plugin.training.pictures import draw_sheet, picture_names, to_bytes, write_png
-from visdom_plugin.training.rundir import read_record
+from visdom_plugin.training.runs.run_directory import read_record
 
 
 def main(argv: list[str]) -> None:

@@ -14,7 +14,7 @@ import time
 
 import torch
 
-from visdom_plugin.nerf.hash_grid import HashLayout, encode, encode_mean, initial_table
+from visdom_plugin.nerf.encoding.hash_grid import HashLayout, encode, encode_mean, initial_table
 
 PER_RAY = 32
 

@@ -19,11 +19,11 @@ import time
 import numpy as np
 import torch
 
-from visdom_plugin.cameras import Cameras, look_at_camera, project
-from visdom_plugin.hull.blocks import block_carve
+from visdom_plugin.geometry.cameras import Cameras, look_at_camera, project
+from visdom_plugin.hull.carving.keep_rule import KeepRule, as_fraction
+from visdom_plugin.hull.carving.octree import block_carve
+from visdom_plugin.hull.carving.votes import Grid, dense_carve, gather_silhouettes
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.hull.rule import KeepRule, as_fraction
-from visdom_plugin.hull.votes import Grid, dense_carve, gather_silhouettes
 
 VIEWS, SIZE = 9, 800
 

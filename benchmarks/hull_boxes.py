@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from datamodules import load
-from visdom_plugin.hull.diagnose import measure_coverage
+from visdom_plugin.hull.checks.coverage import measure_coverage
 from visdom_plugin.hull.domain import VisibleDomain
 
 

@@ -19,7 +19,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from datamodules import colmap, colmap_points, load
+from datamodules import load
+from datamodules.files import colmap_model, colmap_points
 
 
 def main() -> None:
@@ -97,8 +98,8 @@ def report_model(repeat: int) -> None:
         write_model(folder)
 
         def read():
-            model = colmap.read_model(folder, "")
-            colmap.cameras_of(model, model.images)
+            model = colmap_model.read_model(folder, "")
+            colmap_model.cameras_of(model, model.images)
 
         plain = fastest(lambda: unpack_points(folder / "points3D.bin"), min(repeat, 3))
         seconds = {

@@ -12,13 +12,13 @@ from dataclasses import replace
 
 import torch
 
-from datamodules.manager import DataManager
-from datamodules.synthetic import SyntheticConfig, make_scene
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
 from method_configs.gs_go import QUICK
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.methods.gs_go import GsGo
+from visdom_plugin.methods.splats.gs_go import GsGo
 from visdom_plugin.scene import Views
+from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.evaluate import evaluate
 from visdom_plugin.training.missing_masks import fill_masks
 

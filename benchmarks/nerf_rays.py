@@ -12,7 +12,8 @@ import time
 
 import torch
 
-from visdom_plugin.nerf import contraction, interlevel, multisampling, step_functions, volume_packed
+from visdom_plugin.nerf.rendering import proposal_losses, volume_packed
+from visdom_plugin.nerf.sampling import contraction, multisampling, step_functions
 
 
 def backward(out) -> None:
@@ -33,8 +34,8 @@ def cases(rays: int):
     learnt = w_coarse.clone().requires_grad_()
     yield (
         "anti-aliased interlevel loss",
-        lambda: backward(interlevel.antialiased_interlevel_loss(fine, w_fine, coarse, learnt, 0.03)),
-        lambda: backward(interlevel._antialiased_torch(fine, w_fine, coarse, learnt, 0.03, 1e-5)),
+        lambda: backward(proposal_losses.antialiased_interlevel_loss(fine, w_fine, coarse, learnt, 0.03)),
+        lambda: backward(proposal_losses._antialiased_torch(fine, w_fine, coarse, learnt, 0.03, 1e-5)),
     )
     density, rgb = torch.rand(rays * 32).requires_grad_(), torch.rand(rays * 32, 3).requires_grad_()
     starts, ends = fine[:, :-1].flatten(), fine[:, 1:].flatten()

@@ -16,9 +16,9 @@ from dataclasses import replace
 
 import torch
 
-from datamodules.manager import DataManager
-from datamodules.synthetic import SyntheticConfig, make_scene
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
 from visdom_plugin import registry
+from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.run import build
 
 

@@ -16,8 +16,8 @@ import statistics
 import sys
 from pathlib import Path
 
-from visdom_plugin.cli.errors import INTERRUPTED
-from visdom_plugin.cli.train import main as visdom_train
+from visdom_plugin.cli.commands.train import main as visdom_train
+from visdom_plugin.cli.entry import INTERRUPTED
 
 COLUMNS = (
     ("psnr", "PSNR dB", 2),

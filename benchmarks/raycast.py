@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from hull import capture, least
 
-from visdom_plugin.cameras import rays_of
+from visdom_plugin.geometry.cameras import rays_of
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.hull.raycast import build_bricks, cast, depth_and_silhouette, march
+from visdom_plugin.hull.queries.raycast import build_bricks, cast, depth_and_silhouette, march
 
 
 def main() -> None:

@@ -18,9 +18,9 @@ import time
 
 import torch
 
-from visdom_plugin.cameras import Cameras, look_at_camera
-from visdom_plugin.rotations import matrix_from_quaternion
-from visdom_plugin.splat.backend_cpu import warm_up
+from visdom_plugin.geometry.cameras import Cameras, look_at_camera
+from visdom_plugin.geometry.rotations import matrix_from_quaternion
+from visdom_plugin.splat.cpu.backend import warm_up
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.rasterise import rasterise
 from visdom_plugin.ssim import _ssim_by_convolution, ssim

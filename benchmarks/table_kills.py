@@ -38,7 +38,16 @@ FILES = ("table.csv", "table.md")
 
 def start(table: Path, out: Path) -> subprocess.Popen:
     """The command under test."""
-    words = [sys.executable, "-m", "visdom_plugin.cli.table", table, "--out", out, "--workers=2", "--quiet"]
+    words = [
+        sys.executable,
+        "-m",
+        "visdom_plugin.cli.commands.table",
+        table,
+        "--out",
+        out,
+        "--workers=2",
+        "--quiet",
+    ]
     return subprocess.Popen([str(word) for word in words], stdout=subprocess.DEVNULL)
 
 
@@ -51,7 +60,7 @@ def list_workers(driver: int) -> list[int]:
             words = (folder / "cmdline").read_bytes()
         except (OSError, IndexError):
             continue
-        if folder.name.isdecimal() and int(parent) == driver and b"visdom_plugin.tables.child" in words:
+        if folder.name.isdecimal() and int(parent) == driver and b"visdom_plugin.tables.run.worker" in words:
             found.append(int(folder.name))
     return found
 

@@ -8,7 +8,7 @@ __all__ = ["load"]
 def __getattr__(name: str):
     # Lazy: importing the package must not import torch.
     if name == "load":
-        from datamodules.detect import load
+        from datamodules.recognise import load
 
         return load
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

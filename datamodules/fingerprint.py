@@ -11,11 +11,11 @@ from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from datamodules.capture import Capture, Chosen, choose_files
-from datamodules.detect import opening, read_capture
-from datamodules.paths import inside, read_plain
+from datamodules.files.paths import inside, read_plain
+from datamodules.open_scene import Capture, Chosen, choose_files
+from datamodules.recognise import opening, read_capture
 from datamodules.request import Request
-from datamodules.view_files import spread_out
+from datamodules.views.reader import spread_out
 from visdom_plugin.errors import SceneError
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.methods.splat_configs import CorgsConfig
+from visdom_plugin.methods.splats.configs import CorgsConfig
 from visdom_plugin.registry import Preset
 
 FULL = CorgsConfig()
@@ -43,7 +43,7 @@ def _preset(suffix: str, description: str, changes: dict) -> Preset:
     return Preset(
         name=f"corgs-lite{suffix}",
         description=description,
-        target="visdom_plugin.methods.corgs_lite:CorgsLite",
+        target="visdom_plugin.methods.splats.corgs_lite:CorgsLite",
         quick=replace(QUICK, **changes),
         full=replace(FULL, **changes),
     )

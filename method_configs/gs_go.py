@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.methods.splat_configs import GsGoConfig
+from visdom_plugin.methods.splats.configs import GsGoConfig
 from visdom_plugin.registry import Preset
 
 FULL = GsGoConfig()
@@ -46,7 +46,7 @@ def _preset(suffix: str, description: str, changes: dict) -> Preset:
     return Preset(
         name=f"3dgs-go{suffix}",
         description=description,
-        target="visdom_plugin.methods.gs_go:GsGo",
+        target="visdom_plugin.methods.splats.gs_go:GsGo",
         quick=replace(QUICK, **changes),
         full=replace(FULL, **changes),
     )

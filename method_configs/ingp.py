@@ -9,8 +9,8 @@ from dataclasses import replace
 
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.methods.configs import IngpConfig
-from visdom_plugin.nerf.hash_layout import HashLayout
+from visdom_plugin.methods.fields.configs import IngpConfig
+from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 from visdom_plugin.registry import Preset
 
 FULL = IngpConfig()
@@ -41,7 +41,7 @@ def _preset(suffix: str, description: str, changes: dict) -> Preset:
     return Preset(
         name=f"ingp{suffix}",
         description=description,
-        target="visdom_plugin.methods.ingp:Ingp",
+        target="visdom_plugin.methods.fields.ingp:Ingp",
         quick=replace(QUICK, **changes),
         full=replace(FULL, **changes),
     )

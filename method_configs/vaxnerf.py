@@ -22,7 +22,7 @@ def _preset(suffix: str, description: str, sampler: SamplerConfig) -> Preset:
     return Preset(
         name=f"vaxnerf{suffix}",
         description=description,
-        target="visdom_plugin.methods.ingp:Ingp",
+        target="visdom_plugin.methods.fields.ingp:Ingp",
         quick=replace(QUICK, hull=HULL, vd=sampler),
         full=replace(FULL, hull=HULL, vd=sampler),
     )

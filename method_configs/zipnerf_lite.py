@@ -9,8 +9,8 @@ from dataclasses import replace
 
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.methods.configs import ZipNerfConfig
-from visdom_plugin.nerf.hash_layout import HashLayout
+from visdom_plugin.methods.fields.configs import ZipNerfConfig
+from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 from visdom_plugin.registry import Preset
 
 FULL = ZipNerfConfig()
@@ -45,7 +45,7 @@ def _preset(suffix: str, description: str, changes: dict) -> Preset:
     return Preset(
         name=f"zipnerf-lite{suffix}",
         description=description,
-        target="visdom_plugin.methods.zipnerf_lite:ZipNerfLite",
+        target="visdom_plugin.methods.fields.zipnerf_lite:ZipNerfLite",
         quick=replace(QUICK, **changes),
         full=replace(FULL, **full),
     )

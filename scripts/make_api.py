@@ -13,15 +13,15 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "api.md"
 MODULES = {
-    "visdom_plugin/cameras.py": "Cameras and rays",
+    "visdom_plugin/geometry/cameras.py": "Cameras and rays",
     "visdom_plugin/hull/domain.py": "Carving",
     "visdom_plugin/hull/hull.py": "The hull",
     "visdom_plugin/hooks/sampler.py": "Radiance fields",
     "visdom_plugin/hooks/regularizer.py": "Gaussians",
     "visdom_plugin/hooks/protocols.py": "What hooks are",
     "visdom_plugin/hooks/configs.py": "Settings of hooks",
-    "visdom_plugin/hooks/adapters/gsplat.py": "gsplat",
-    "visdom_plugin/hooks/adapters/nerfacc.py": "nerfacc",
+    "visdom_plugin/integrations/gsplat.py": "gsplat",
+    "visdom_plugin/integrations/nerfacc.py": "nerfacc",
     "visdom_plugin/render.py": "Renders",
     "visdom_plugin/scene.py": "Scenes",
     "visdom_plugin/errors.py": "Errors",

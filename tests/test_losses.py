@@ -5,7 +5,7 @@ import torch
 
 from visdom_plugin.hooks.regularizer import outside_loss
 from visdom_plugin.losses import below_one, composite, disparity_loss, mask_loss, photometric_loss
-from visdom_plugin.nerf.volume import weights_from_density
+from visdom_plugin.nerf.rendering.volume import weights_from_density
 from visdom_plugin.ssim import ssim
 
 

@@ -14,12 +14,12 @@ from importlib.metadata import EntryPoint, entry_points
 
 import pytest
 
-from visdom_plugin.cli.doctor import examine
+from visdom_plugin.cli.methods_doctor import examine
 from visdom_plugin.errors import ConfigError, PluginError
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.registry import GROUP, MethodSpec, Preset, Registry, discover
-from visdom_plugin.training.settings import as_plain, from_plain
+from visdom_plugin.training.runs.config_io import as_plain, from_plain
 
 
 def _preset(name: str) -> Preset:
@@ -257,7 +257,7 @@ SPEC = MethodSpec("strange", "heavy_method:Method", Config(), hook="sampler", de
 
 def _command(tmp_path, *words, **variables):
     environment = os.environ | {"PYTHONPATH": str(tmp_path)} | variables
-    code = "import sys; from visdom_plugin.cli.methods import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from visdom_plugin.cli.commands.methods import main; sys.exit(main(sys.argv[1:]))"
     run = [sys.executable, "-c", code, *words]
     return subprocess.run(run, env=environment, capture_output=True, text=True, timeout=300)
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from visdom_plugin.cameras import Cameras
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.scene import Views, describe_masks
 
 

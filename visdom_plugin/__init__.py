@@ -10,8 +10,8 @@ from importlib import import_module
 __version__ = "0.1.0"
 
 _HOME = {
-    "Cameras": "visdom_plugin.cameras",
-    "Rays": "visdom_plugin.cameras",
+    "Cameras": "visdom_plugin.geometry.cameras",
+    "Rays": "visdom_plugin.geometry.cameras",
     "Render": "visdom_plugin.render",
     "Scene": "visdom_plugin.scene",
     "Views": "visdom_plugin.scene",

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from visdom_plugin.cameras import Cameras
+from visdom_plugin.geometry.cameras import Cameras
 
 MaskOrigin = Literal["given", "missing", "hull", "colour"]
 """given: the data has it. missing: it has none, `masks` is True everywhere and says nothing. hull: the outline

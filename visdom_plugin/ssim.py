@@ -9,7 +9,7 @@ from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from visdom_plugin.threads import spread
+from visdom_plugin.compute.parallel import spread
 
 RADIUS = 5
 TAPS = 2 * RADIUS + 1

@@ -11,10 +11,10 @@ import torch
 
 from tests.hull.balls import ball_masks, ring
 from tests.training import fake
-from visdom_plugin.cameras import Cameras
-from visdom_plugin.cli import evaluate, hull, train
+from visdom_plugin.cli.commands import evaluate, hull, train
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.hull.raycast import depth_and_silhouette
+from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.scene import Scene, Views
 
 BALL = [((0.1, 0, 0), 0.5)]

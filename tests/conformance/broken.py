@@ -15,8 +15,8 @@ from method_configs import corgs_lite, gs_go, ingp, zipnerf_lite
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
 from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.methods.gs_go import GsGo
-from visdom_plugin.nerf.hash_layout import HashLayout
+from visdom_plugin.methods.splats.gs_go import GsGo
+from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 from visdom_plugin.registry import MethodSpec, Preset
 
 HULL = VisibleDomain(resolution=48, dilate_px=1)
@@ -328,12 +328,12 @@ def _methods() -> list[MethodSpec | Preset]:
             if issubclass(broken, GsGo)
             else [_field_spec(name, target, broken.settings, vd)]
         )
-    found += _splat_presets("SmallGsGo", "visdom_plugin.methods.gs_go:GsGo", gs_go)
-    found += _splat_presets("SmallCorgs", "visdom_plugin.methods.corgs_lite:CorgsLite", corgs_lite)
+    found += _splat_presets("SmallGsGo", "visdom_plugin.methods.splats.gs_go:GsGo", gs_go)
+    found += _splat_presets("SmallCorgs", "visdom_plugin.methods.splats.corgs_lite:CorgsLite", corgs_lite)
     grid = HashLayout(4, 2, base_resolution=8, max_resolution=64, log2_table_size=12)
     found += _field_presets(
         "SmallIngp",
-        "visdom_plugin.methods.ingp:Ingp",
+        "visdom_plugin.methods.fields.ingp:Ingp",
         ingp,
         steps=40,
         max_rays=256,
@@ -345,7 +345,7 @@ def _methods() -> list[MethodSpec | Preset]:
     )
     found += _field_presets(
         "SmallZipNerf",
-        "visdom_plugin.methods.zipnerf_lite:ZipNerfLite",
+        "visdom_plugin.methods.fields.zipnerf_lite:ZipNerfLite",
         zipnerf_lite,
         steps=40,
         rays=128,

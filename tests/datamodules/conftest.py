@@ -1,7 +1,7 @@
 import pytest
 
-from datamodules.synthetic import SyntheticConfig, make_scene
-from tests.datamodules.prepared_writer import write_prepared
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from tests.datamodules.layouts.prepared_writer import write_prepared
 
 
 @pytest.fixture(scope="session")

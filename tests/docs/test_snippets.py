@@ -22,9 +22,9 @@ def blocks(page: Path) -> list[tuple[int, str]]:
 
 def what_the_readme_presupposes() -> dict:
     """The README's reader brings arrays, rays, a loss and a way to draw: here, of the built-in scene."""
-    from datamodules.synthetic import SyntheticConfig, make_scene
+    from datamodules.synthetic.scene import SyntheticConfig, make_scene
     from visdom_plugin import Render
-    from visdom_plugin.cameras import rays_of
+    from visdom_plugin.geometry.cameras import rays_of
 
     views = make_scene(SyntheticConfig(size=32, train_views=4, test_views=0)).train
     rays = rays_of(views.cameras, torch.rand(4, 10, 2, dtype=torch.float64) * 32)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from datamodules.synthetic import SyntheticConfig, make_scene
-from tests.datamodules.prepared_writer import write_prepared
-from visdom_plugin.cli import table
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from tests.datamodules.layouts.prepared_writer import write_prepared
+from visdom_plugin.cli.commands import table
 from visdom_plugin.tables.spec import load_table
 
 PAGE = (Path(__file__).parents[2] / "docs/tables.md").read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from datamodules.synthetic import SyntheticConfig, make_scene
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "my_method"
 
@@ -75,11 +75,11 @@ def run(tmp_path_factory):
 
 
 def test_all_three_variants_are_listed_with_their_settings(run):
-    listed = run("visdom_plugin.cli.methods")
+    listed = run("visdom_plugin.cli.commands.methods")
     assert listed.returncode == 0 and not listed.stderr
     for name in ("method:my-method ", "method:my-method+mask ", "method:my-method+vd "):
         assert name in listed.stdout
-    described = run("visdom_plugin.cli.train", "method:my-method+vd", "--help")
+    described = run("visdom_plugin.cli.commands.train", "method:my-method+vd", "--help")
     assert described.returncode == 0, described.stderr
     # Its own, those added, and what those are.
     for words in ("--method.rays", "--method.mask-weight", "--method.hull.k", "Weight of the binary cross"):
@@ -89,7 +89,7 @@ def test_all_three_variants_are_listed_with_their_settings(run):
 def test_it_trains_in_the_visible_domain(run, tmp_path):
     small = ("--method.steps", "12", "--method.rays", "128", "--method.hull.resolution", "48")
     words = ("--downscale", "4", *small, "--device", "cpu", "--out", str(tmp_path / "run"))
-    done = run("visdom_plugin.cli.train", "method:my-method+vd", *words)
+    done = run("visdom_plugin.cli.commands.train", "method:my-method+vd", *words)
     assert done.returncode == 0, done.stderr
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert record["status"] == "finished" and record["method"] == "my-method+vd"
@@ -97,7 +97,7 @@ def test_it_trains_in_the_visible_domain(run, tmp_path):
     assert record["config"]["hull"]["resolution"] == 48 and record["config"]["rays"] == 128
     assert record["metrics"]["test"]["psnr"] > 3
     assert (tmp_path / "run" / "hull" / "hull.npz").is_file() and (tmp_path / "run" / "checkpoints").is_dir()
-    again = run("visdom_plugin.cli.evaluate", str(tmp_path / "run"))
+    again = run("visdom_plugin.cli.commands.evaluate", str(tmp_path / "run"))
     assert again.returncode == 0, again.stderr
     measured = json.loads((tmp_path / "run" / "run.json").read_text())["metrics"]["test"]
     assert measured == record["metrics"]["test"]

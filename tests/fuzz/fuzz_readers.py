@@ -25,10 +25,12 @@ import cv2
 import numpy as np
 import torch
 
-from datamodules import actorshq, colmap, colmap_points, images, llff, masks, splits, transforms
+from datamodules.files import colmap_model, colmap_points, images, masks
+from datamodules.layouts import actorshq, llff, transforms
 from datamodules.request import Request
-from datamodules.synthetic import SyntheticConfig, make_scene
-from tests.datamodules import layout_writers as w
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.views import splits
+from tests.datamodules.layouts import layout_writers as w
 from tests.fuzz.mutate import damage, damage_json, damage_png
 from visdom_plugin.errors import SceneError
 
@@ -60,7 +62,7 @@ def make_readers(root: Path) -> dict[str, Reader]:
     w.write_instant_ngp(views, root / "ngp")
     w.write_actorshq(views, root / "actor")
     w.write_poses_bounds(views, root / "poses.npy")
-    model = colmap.read_model(root / "bin", "sparse/0")
+    model = colmap_model.read_model(root / "bin", "sparse/0")
 
     def of(*names: str) -> list[bytes]:
         return [(root / n).read_bytes() for n in names]
@@ -83,15 +85,15 @@ def make_readers(root: Path) -> dict[str, Reader]:
             found = parse(data, NOWHERE)
             image = model.images[0]
             for camera_id in list(found)[:8]:
-                one = colmap.Registered(image.name, image.quaternion, image.translation, camera_id)
-                colmap.cameras_of(colmap.Model(NOWHERE, found, (one,)), [one])
+                one = colmap_model.Registered(image.name, image.quaternion, image.translation, camera_id)
+                colmap_model.cameras_of(colmap_model.Model(NOWHERE, found, (one,)), [one])
 
         return read
 
     def read_images(parse):
         def read(data: bytes):
             found = parse(data, NOWHERE)
-            colmap.cameras_of(colmap.Model(NOWHERE, model.cameras, tuple(found)), found)
+            colmap_model.cameras_of(colmap_model.Model(NOWHERE, model.cameras, tuple(found)), found)
 
         return read
 
@@ -123,11 +125,11 @@ def make_readers(root: Path) -> dict[str, Reader]:
 
     points_bin, points_txt = with_points(False), with_points(True)
     return {
-        "cameras.bin": Reader([cameras_bin], read_cameras(colmap.parse_cameras_binary)),
-        "images.bin": Reader([images_bin], read_images(colmap.parse_images_binary)),
+        "cameras.bin": Reader([cameras_bin], read_cameras(colmap_model.parse_cameras_binary)),
+        "images.bin": Reader([images_bin], read_images(colmap_model.parse_images_binary)),
         "points3D.bin": Reader([points_bin], lambda d: colmap_points.parse_points_binary(d, NOWHERE)),
-        "cameras.txt": Reader([cameras_txt], read_cameras(colmap.parse_cameras_text)),
-        "images.txt": Reader([images_txt], read_images(colmap.parse_images_text)),
+        "cameras.txt": Reader([cameras_txt], read_cameras(colmap_model.parse_cameras_text)),
+        "images.txt": Reader([images_txt], read_images(colmap_model.parse_images_text)),
         "points3D.txt": Reader([points_txt], lambda d: colmap_points.parse_points_text(d, NOWHERE)),
         "transforms.json": Reader(jsons, read_transforms, damage_json),
         "poses_bounds.npy": Reader([poses], read_poses),

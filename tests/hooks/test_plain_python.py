@@ -12,8 +12,8 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from visdom_plugin import Cameras, Render, VisDomGaussianRegularizer, VisDomSampler, VisibleDomain
-from visdom_plugin.cameras import rays_of
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.geometry.cameras import rays_of
 from visdom_plugin.hooks.regularizer import outside_loss
 
 from .test_regularizer import SIZE, capture

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from visdom_plugin import Cameras, Hull, Render, VisDomGaussianRegularizer, VisibleDomain
-from visdom_plugin.cameras import look_at_camera, project, rays_of
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.geometry.cameras import look_at_camera, project, rays_of
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hooks.regularizer import outside_loss
-from visdom_plugin.hull.raycast import depth_and_silhouette
+from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.rasterise import rasterise
 

@@ -11,7 +11,7 @@ from visdom_plugin import Hull, VisDomSampler
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import SamplerHook
-from visdom_plugin.hull.raycast import cast
+from visdom_plugin.hull.queries.raycast import cast
 from visdom_plugin.scene import Views
 
 from ..hull.balls import ring

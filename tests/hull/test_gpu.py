@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from tests.hull.balls import ball_masks, ring
-from tests.hull.test_votes import random_case
-from visdom_plugin.hull.blocks import block_carve
+from tests.hull.carving.test_votes import random_case
+from visdom_plugin.hull.carving.octree import block_carve
+from visdom_plugin.hull.carving.votes import dense_carve, gather_silhouettes
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.hull.raycast import cast, depth_and_silhouette
-from visdom_plugin.hull.votes import dense_carve, gather_silhouettes
+from visdom_plugin.hull.queries.raycast import cast, depth_and_silhouette
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 

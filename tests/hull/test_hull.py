@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from visdom_plugin.errors import CheckpointError, ConfigError, EmptyHullError
-from visdom_plugin.hull.components import choose_pieces, erase_pieces, find_pieces
+from visdom_plugin.hull.grid.components import choose_pieces, erase_pieces, find_pieces
+from visdom_plugin.hull.grid.mesh import is_closed, mesh_grid
 from visdom_plugin.hull.hull import Hull, write_whole
-from visdom_plugin.hull.mesh import is_closed, mesh_grid
-from visdom_plugin.hull.raycast import cast, march
+from visdom_plugin.hull.queries.raycast import cast, march
 
 
 def ball(n: int = 40, radius: float = 0.7) -> Hull:

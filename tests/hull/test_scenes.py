@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from visdom_plugin.hull.diagnose import measure_coverage
+from visdom_plugin.hull.checks.coverage import measure_coverage
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.hull.mesh import is_closed
+from visdom_plugin.hull.grid.mesh import is_closed
 
 ROOT = os.environ.get("VISDOM_SCENES")
 pytestmark = [

@@ -2,7 +2,7 @@
 
 import torch
 
-from datamodules.manager import DataManager
+from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.run import choose_batches
 
 CPU = torch.device("cpu")

@@ -8,7 +8,7 @@ import pytest
 
 PROGRAM = """
 import hashlib, torch
-from visdom_plugin.cameras import Cameras
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.rasterise import rasterise
 from visdom_plugin.ssim import ssim

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from visdom_plugin.rotations import matrix_from_quaternion
+from visdom_plugin.geometry.rotations import matrix_from_quaternion
 from visdom_plugin.splat.densify import initial_log_scales, split_children, stray_gaussians
 
 

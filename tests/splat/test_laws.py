@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from tests.splat.twin import make_camera, make_gaussians
-from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.rotations import matrix_from_quaternion, quaternion_from_matrix
-from visdom_plugin.splat import backend_cpu, blending, projection, tiles
+from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from visdom_plugin.splat.cpu import backend, blending, projection, tiles
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.rasterise import rasterise
 
@@ -141,7 +141,7 @@ def test_warm_up_leaves_nothing_to_compile():
         projection.project, projection.project_backward, tiles._count, tiles._list, tiles._fill,
         tiles._radix_order, blending.blend, blending.blend_backward, blending.gather, blending.drawn_starts_of,
     ]  # fmt: skip
-    backend_cpu.warm_up()
+    backend.warm_up()
     before = [len(kernel.signatures) for kernel in kernels]
     for n, camera in ((50, make_camera()), (0, make_camera(5, 3)), (7, make_camera(100, 20))):
         render_with_gradients(make_gaussians(n=n, dtype=torch.float32, degree=min(n, 3)), camera)

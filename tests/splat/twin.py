@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import torch
 
-from visdom_plugin.cameras import Cameras, look_at_camera
-from visdom_plugin.rotations import matrix_from_quaternion
+from visdom_plugin.geometry.cameras import Cameras, look_at_camera
+from visdom_plugin.geometry.rotations import matrix_from_quaternion
 from visdom_plugin.splat.gaussians import Gaussians
 
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from visdom_plugin.atomic_files import write_bytes
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables.driver import run_plan
-from visdom_plugin.tables.executors import Local
-from visdom_plugin.tables.jobs import Plan, Resolved, Workshop, plan
 from visdom_plugin.tables.results import Results
+from visdom_plugin.tables.run.driver import run_plan
+from visdom_plugin.tables.run.executors import Local
+from visdom_plugin.tables.run.jobs import Plan, Resolved, Workshop, plan
 from visdom_plugin.tables.spec import TableSpec, parse_table
-from visdom_plugin.training.files import write_bytes
 
 ROOT = Path(__file__).resolve().parents[2]
 METHODS = ("one", "two", "three+vd")
@@ -56,7 +56,7 @@ def resolve(kind: str, method: str, budget: str) -> Resolved | None:
 
 
 def workshop(**changes: Any) -> Workshop:
-    modules = {"train": "tests.tables.fake_train", "hull": "tests.tables.fake_train"}
+    modules = {"train": "tests.tables.run.fake_train", "hull": "tests.tables.run.fake_train"}
     return Workshop(**({"resolve": resolve, "modules": modules, "hash_data": hash_data} | changes))
 
 

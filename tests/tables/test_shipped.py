@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 
 from method_configs.not_built import NOT_BUILT
-from visdom_plugin.cli.table import Options, make_workshop
-from visdom_plugin.tables.jobs import plan
-from visdom_plugin.tables.layout import list_views, read_layout
+from visdom_plugin.cli.commands.table import Options, make_workshop
 from visdom_plugin.tables.measures import find_measure
 from visdom_plugin.tables.paper import find_number, load_numbers
+from visdom_plugin.tables.report.layout import list_views, read_layout
+from visdom_plugin.tables.report.summary import summarise
+from visdom_plugin.tables.report.write import write_all
 from visdom_plugin.tables.results import Results
+from visdom_plugin.tables.run.jobs import plan
 from visdom_plugin.tables.spec import list_editions, list_tables, load_table
-from visdom_plugin.tables.summary import summarise
-from visdom_plugin.tables.write import write_all
 
 EDITIONS = [
     (name, edition) for name, path in list_tables().items() for edition in (None, *list_editions(path))

@@ -7,9 +7,9 @@ import json
 import pytest
 import torch
 
+from visdom_plugin.atomic_files import MARK, appearing, remove_parts, write_json
 from visdom_plugin.errors import CheckpointError
-from visdom_plugin.training import checkpoints
-from visdom_plugin.training.files import MARK, appearing, remove_parts, write_json
+from visdom_plugin.training.runs import checkpoints
 
 
 def _state(step: int) -> dict[str, torch.Tensor]:

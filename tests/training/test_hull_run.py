@@ -8,14 +8,14 @@ import pytest
 import torch
 import trimesh
 
-from datamodules.synthetic import SyntheticConfig, make_scene
-from datamodules.target_mesh import find_mesh, load_mesh
-from visdom_plugin.cli import measure_hull as command
+from datamodules.files.target_mesh import find_mesh, load_mesh
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from visdom_plugin.cli.hulls import measure_hull as command
 from visdom_plugin.errors import CheckpointError, EmptyHullError, SceneError
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.hull.mesh import is_closed
-from visdom_plugin.training.hull_run import DISTANCES, VOLUMES, carve_run, measure_hull
-from visdom_plugin.training.hull_settings import HullRunConfig
+from visdom_plugin.hull.grid.mesh import is_closed
+from visdom_plugin.training.hull_run.config import HullRunConfig
+from visdom_plugin.training.hull_run.run import DISTANCES, VOLUMES, carve_run, measure_hull
 
 DOMAIN = VisibleDomain(resolution=48)
 

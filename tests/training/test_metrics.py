@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from visdom_plugin.render import quantise
 from visdom_plugin.training import metrics
 
 
@@ -16,7 +17,7 @@ def pair():
     y = torch.nn.functional.interpolate(torch.rand(1, 3, 9, 11, generator=draw), (45, 52), mode="bicubic")[0]
     y = y.permute(1, 2, 0)
     x = y + 0.1 * torch.randn(45, 52, 3, generator=draw) * torch.tensor([0.3, 1.0, 2.0])
-    return metrics.quantise(x), metrics.quantise(y)
+    return quantise(x), quantise(y)
 
 
 def test_psnr_agrees_with_scikit_image_and_torchmetrics(pair):
@@ -64,8 +65,8 @@ def test_foreground_psnr_sees_the_mask_alone(pair):
 
 def test_quantised_images_are_what_an_8_bit_file_holds():
     x = torch.tensor([-0.3, 0.0, 0.4999 / 255, 0.5001 / 255, 0.699, 1.0, 1.2])
-    assert (metrics.quantise(x) * 255).tolist() == [0, 0, 0, 1, 178, 255, 255]
-    assert torch.equal(metrics.quantise(metrics.quantise(x)), metrics.quantise(x))
+    assert (quantise(x) * 255).tolist() == [0, 0, 0, 1, 178, 255, 255]
+    assert torch.equal(quantise(quantise(x)), quantise(x))
 
 
 def test_the_photographs_background_does_not_count(pair):
@@ -171,8 +172,7 @@ def test_ssim_with_ignored_pixels_charges_the_others_with_all_that_differs():
     ignore[:, 30:] = True
     found = metrics.compare(rgb, alpha, image, mask, ignore=ignore)["ssim"]
     x, y = (
-        torch.where(ignore[..., None], 1.0, z)
-        for z in (metrics.quantise(rgb), metrics.quantise(metrics.whiten(image, mask)))
+        torch.where(ignore[..., None], 1.0, z) for z in (quantise(rgb), quantise(metrics.whiten(image, mask)))
     )
     whole = float(ssim(x.float(), y.float()))
     assert found == pytest.approx(1 - (1 - whole) * 48 / 30, abs=1e-9) and found < whole

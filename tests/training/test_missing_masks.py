@@ -6,19 +6,19 @@ from dataclasses import replace
 import pytest
 import torch
 
-from datamodules.manager import DataManager
-from datamodules.synthetic import SyntheticConfig, make_scene
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
 from method_configs.gs_go import QUICK
 from visdom_plugin.errors import SceneError
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.hull.raycast import depth_and_silhouette
-from visdom_plugin.methods.gs_go import GsGo
+from visdom_plugin.hull.queries.raycast import depth_and_silhouette
+from visdom_plugin.methods.splats.gs_go import GsGo
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Scene, Views
+from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.evaluate import evaluate
 from visdom_plugin.training.metrics import NAMES, PROTOCOL
 from visdom_plugin.training.missing_masks import fill_masks, outline_views
-from visdom_plugin.training.rundir import hash_views
+from visdom_plugin.training.runs.run_directory import hash_views
 
 DOMAIN = VisibleDomain(resolution=48)
 CPU = torch.device("cpu")

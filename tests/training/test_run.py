@@ -19,8 +19,9 @@ import torch
 from tests.training.fake import FakeConfig, FakeInner, FakeManager, FakeMethod, tiny_views
 from visdom_plugin.errors import CheckpointError, EmptyHullError
 from visdom_plugin.scene import Scene, Views
-from visdom_plugin.training import checkpoints, metrics
+from visdom_plugin.training import metrics
 from visdom_plugin.training.run import Interrupted
+from visdom_plugin.training.runs import checkpoints
 from visdom_plugin.training.trainer import TrainingError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.training.settings import as_plain, differences, from_plain
+from visdom_plugin.training.runs.config_io import as_plain, differences, from_plain
 
 _FLOATS = st.floats(allow_nan=False, allow_infinity=False)
 

@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from datamodules.detect import FORMATS
+from datamodules.recognise import FORMATS
 from visdom_plugin import registry
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.training.settings import as_plain, differences, from_plain
+from visdom_plugin.training.runs.config_io import as_plain, differences, from_plain
 
 WORD = "method:"
 DataFormat = Literal[tuple(FORMATS)]

@@ -12,7 +12,7 @@ from visdom_plugin.scene import Scene
 
 def make_data_manager(views, seed: int, device) -> Any:
     """Batches of the training views on a device."""
-    from datamodules.manager import DataManager
+    from visdom_plugin.training.batches import DataManager
 
     return DataManager(views, seed, device=device)
 
@@ -67,7 +67,7 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None, *, test: bo
         CheckpointError: when what is found there is not what the run was trained on, or measured on.
         SceneError: when it cannot be read.
     """
-    from visdom_plugin.training.rundir import hash_views
+    from visdom_plugin.training.runs.run_directory import hash_views
 
     noted = record["data"]
     path = data if data is not None else noted.get("path")
@@ -138,8 +138,8 @@ def open_run(run: Path, data: Path | None, device_name: str, *, test: bool = Tru
     from visdom_plugin import registry
     from visdom_plugin.cli.options import resolve_device
     from visdom_plugin.training.run import restore
-    from visdom_plugin.training.rundir import read_record
-    from visdom_plugin.training.settings import from_plain
+    from visdom_plugin.training.runs.config_io import from_plain
+    from visdom_plugin.training.runs.run_directory import read_record
 
     record = read_record(run)
     preset = registry.find(record["method"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from visdom_plugin import registry
-from visdom_plugin.conformance.bench import Subject
+from visdom_plugin.conformance.subject import Subject
 
 
 def pytest_generate_tests(metafunc) -> None:

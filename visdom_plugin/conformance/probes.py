@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.cameras import look_at_point
-from visdom_plugin.conformance.bench import scene
+from visdom_plugin.conformance.subject import scene
+from visdom_plugin.geometry.cameras import look_at_point
 from visdom_plugin.hooks.protocols import RayBounds
 
 

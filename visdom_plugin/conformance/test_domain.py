@@ -9,14 +9,14 @@ from typing import Any
 import pytest
 import torch
 
-from datamodules.manager import DataManager
-from visdom_plugin.conformance.bench import carve, mass_outside, scene
 from visdom_plugin.conformance.probes import GaussianProbe, SamplerProbe, distance, gradient
 from visdom_plugin.conformance.report import require
+from visdom_plugin.conformance.subject import carve, mass_outside, scene
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import GaussianHook, SamplerHook
 from visdom_plugin.hooks.sampler import VisDomSampler
+from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.protocols import Method
 from visdom_plugin.training.run import choose_batches
 

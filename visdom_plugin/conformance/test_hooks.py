@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from datamodules.manager import DataManager
-from visdom_plugin.conformance.bench import difference, global_luck, scene, seed_all
 from visdom_plugin.conformance.report import require
+from visdom_plugin.conformance.subject import difference, global_luck, scene, seed_all
 from visdom_plugin.hooks.protocols import GaussianHook, SamplerHook
 from visdom_plugin.render import Render
+from visdom_plugin.training.batches import DataManager
 
 
 def rays(dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:

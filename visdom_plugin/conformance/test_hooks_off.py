@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from visdom_plugin.conformance.bench import difference
 from visdom_plugin.conformance.report import require
+from visdom_plugin.conformance.subject import difference
 from visdom_plugin.training.protocols import Method
 
 TODO = "do for the visible domain only what the objects in `hooks` say"

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.manager import DataManager
-from visdom_plugin.conformance.bench import CPU, copy_state, difference, scene
 from visdom_plugin.conformance.report import require
+from visdom_plugin.conformance.subject import CPU, copy_state, difference, scene
 from visdom_plugin.render import Render
+from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.protocols import Method
 from visdom_plugin.training.run import choose_batches
 

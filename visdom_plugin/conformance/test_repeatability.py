@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from visdom_plugin.conformance.bench import difference
 from visdom_plugin.conformance.report import require
-from visdom_plugin.training import checkpoints
+from visdom_plugin.conformance.subject import difference
 from visdom_plugin.training.protocols import Method
+from visdom_plugin.training.runs import checkpoints
 
 
 def test_randomness_comes_from_seed_and_step_alone(subject):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Generator, Tensor
 
-from visdom_plugin.cameras import Cameras
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.render import Render
 
 

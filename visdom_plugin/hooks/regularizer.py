@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.cameras import Cameras, interpolate, project, require_batch
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.geometry.cameras import Cameras, interpolate, project, require_batch
 from visdom_plugin.hull.hull import Hull
-from visdom_plugin.hull.paint import check_images, colour_points
-from visdom_plugin.hull.raycast import depth_and_silhouette
+from visdom_plugin.hull.queries.point_colours import check_images, colour_points
+from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.losses import below_one
 from visdom_plugin.render import Render
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.hooks import opaque
+from visdom_plugin.hooks import torch_ops
 from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.hull import Hull
-from visdom_plugin.hull.raycast import cast
+from visdom_plugin.hull.queries.raycast import cast
 
 DEFAULT_EPSILON_HULL_RADII = 0.1
 """About 0.03 camera distances for an object that fills half the picture; FINDINGS.md has the sweep."""
@@ -91,11 +91,11 @@ class VisDomSampler:
             )
         self.hull, self.epsilon_world = hull, float(epsilon_world)
         self.interval, self.missing, self.drop_outside = interval, missing, drop_outside
-        self._number = opaque.enter(self)
+        self._number = torch_ops.enter(self)
 
     def __setstate__(self, state: dict) -> None:
         self.__dict__.update(state)
-        self._number = opaque.enter(self)
+        self._number = torch_ops.enter(self)
 
     def __call__(self, origins: Tensor, directions: Tensor, near, far) -> RayBounds:
         """The same as `bound`."""

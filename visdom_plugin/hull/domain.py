@@ -111,6 +111,6 @@ class VisibleDomain:
             SceneError: when masks and cameras do not fit each other: in number or size, or, with automatic bounds,
                 because the hull covers little of the masks and would cover them with poses of another convention.
         """
-        from visdom_plugin.hull.carve import carve
+        from visdom_plugin.hull.carving.carve import carve
 
         return carve(self, cameras, masks)

@@ -18,7 +18,7 @@ from torch import Generator, Tensor
 
 from visdom_plugin.errors import CheckpointError
 from visdom_plugin.hull.foreign import check_bounds, check_grid
-from visdom_plugin.hull.mesh import mesh_grid
+from visdom_plugin.hull.grid.mesh import mesh_grid
 
 _SCHEMA = 1
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from visdom_plugin.cameras import Cameras, look_at_point
+from visdom_plugin.geometry.cameras import Cameras, look_at_point
 
 
 class Frame(NamedTuple):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import PluginError
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.render import Render
 from visdom_plugin.splat.gaussians import Gaussians
 

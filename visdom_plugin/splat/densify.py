@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.rotations import matrix_from_quaternion
+from visdom_plugin.geometry.rotations import matrix_from_quaternion
 
 
 def initial_log_scales(means: Tensor) -> Tensor:

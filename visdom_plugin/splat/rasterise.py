@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.render import Render
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.spherical_harmonics import MAX_DEGREE
@@ -65,7 +65,7 @@ def rasterise(
             todo='use backend="auto", or move the Gaussians with .to(device)',
         )
     if chosen == "cpu":
-        from visdom_plugin.splat.backend_cpu import rasterise_cpu as draw
+        from visdom_plugin.splat.cpu.backend import rasterise_cpu as draw
     else:
         from visdom_plugin.splat.backend_gsplat import rasterise_gsplat as draw
     return draw(gaussians, camera, background, degree, near)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from visdom_plugin.harmonics import C0
+from visdom_plugin.geometry.harmonics import C0
 
 MAX_DEGREE = 3
 

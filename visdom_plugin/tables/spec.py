@@ -15,7 +15,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.training.settings import from_plain
+from visdom_plugin.training.runs.config_io import from_plain
 
 BUILT_IN = "built-in"
 """Root and scene name of the scene that needs no folder."""

@@ -12,11 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from visdom_plugin.cameras import Cameras
 from visdom_plugin.errors import EmptyHullError
-from visdom_plugin.scene import Views
-from visdom_plugin.training import metrics
-from visdom_plugin.training.pictures import (
+from visdom_plugin.figures.contact_sheet import (
     SHEET_ROWS,
     draw_sheet,
     picture_names,
@@ -24,6 +21,9 @@ from visdom_plugin.training.pictures import (
     to_bytes,
     write_png,
 )
+from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.scene import Views
+from visdom_plugin.training import metrics
 from visdom_plugin.training.protocols import Method
 
 log = logging.getLogger(__name__)
@@ -122,6 +122,6 @@ def carve_reference(views: Views, domain: Any = None) -> Any | None:
 
 def hull_silhouette(hull: Any, camera: Cameras) -> Tensor:
     """(H, W) bool, True where a pixel's ray meets the hull."""
-    from visdom_plugin.hull.raycast import depth_and_silhouette
+    from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 
     return torch.as_tensor(depth_and_silhouette(hull, camera)[1]).cpu()

@@ -31,11 +31,6 @@ NAMES = (
 )
 
 
-def quantise(image: Tensor) -> Tensor:
-    """An image as an 8-bit file would hold it: any shape, clamped to [0, 1], in steps of 1/255, float64."""
-    return (image.double().clamp(0, 1) * 255).round() / 255
-
-
 def whiten(image: Tensor, mask: Tensor) -> Tensor:
     """The photograph on white: (H, W, 3) uint8 and (H, W) bool to (H, W, 3) float64 in [0, 1]."""
     return torch.where(mask[..., None], image.double() / 255, 1.0)
@@ -105,6 +100,7 @@ def compare(
     Returns:
         A dict with the keys `NAMES`; NaN where a metric does not apply.
     """
+    from visdom_plugin.render import quantise
     from visdom_plugin.ssim import ssim
 
     x, y = quantise(rgb), quantise(whiten(image, mask))

@@ -81,7 +81,7 @@ def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> S
 
 def outline_views(hull, views: Views, indices: Sequence[int]) -> dict[int, Tensor]:
     """(H, W) bool by index: where the pixels' rays meet the hull."""
-    from visdom_plugin.hull.raycast import depth_and_silhouette
+    from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 
     return {i: depth_and_silhouette(hull, views.cameras[i].to("cpu"))[1] for i in indices}
 

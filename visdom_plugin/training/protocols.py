@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from visdom_plugin.cameras import Cameras
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 
@@ -21,8 +21,8 @@ class Method(Protocol):
     draws the same numbers. `visdom_plugin.seeding.generator(seed, "what for", step)` makes such numbers.
 
     A method with a `pixels_per_step(step) -> int` is handed that many pixels of all views per step
-    (`datamodules.manager.PixelBatch`), any other one a whole view (`ViewBatch`). The number may depend on the
-    method's state, which then is part of `state_dict`.
+    (`visdom_plugin.training.batches.PixelBatch`), any other one a whole view (`ViewBatch`). The number may depend
+    on the method's state, which then is part of `state_dict`.
 
     Fields of the config that have a meaning here: `mask_weight`, the weight of the silhouette loss; `hull`, what
     to carve; `vd`, the hook's settings. `visdom_plugin.specs.MethodSpec` adds them where a config lacks them.

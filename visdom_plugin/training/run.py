@@ -13,14 +13,14 @@ from typing import Any
 import torch
 
 from visdom_plugin import registry
+from visdom_plugin.atomic_files import appearing, finite
 from visdom_plugin.errors import CheckpointError, ConfigError, EmptyHullError, PluginError, SceneError
 from visdom_plugin.scene import Scene, Views
-from visdom_plugin.training import checkpoints
 from visdom_plugin.training.evaluate import carve_reference, evaluate
-from visdom_plugin.training.files import appearing, finite
 from visdom_plugin.training.protocols import Method
-from visdom_plugin.training.rundir import RunDir, describe_data
-from visdom_plugin.training.settings import as_plain, differences
+from visdom_plugin.training.runs import checkpoints
+from visdom_plugin.training.runs.config_io import as_plain, differences
+from visdom_plugin.training.runs.run_directory import RunDir, describe_data
 from visdom_plugin.training.trainer import Trainer, view_psnr
 
 log = logging.getLogger(__name__)

@@ -12,10 +12,12 @@ from typing import Any
 import torch
 
 from visdom_plugin.errors import VisDomError
-from visdom_plugin.training import checkpoints, metrics
+from visdom_plugin.render import quantise
+from visdom_plugin.training import metrics
 from visdom_plugin.training.progress import Progress
 from visdom_plugin.training.protocols import Method
-from visdom_plugin.training.rundir import RunDir
+from visdom_plugin.training.runs import checkpoints
+from visdom_plugin.training.runs.run_directory import RunDir
 
 LOGGED = 100
 """Lines in log.jsonl over the whole schedule."""
@@ -171,7 +173,7 @@ def view_psnr(method: Method, views: Any, device: torch.device) -> Callable[[int
         i = step % len(views)
         rgb, _ = render_on_white(method, views.cameras[i], device)
         x, y, ignore = (
-            metrics.quantise(rgb),
+            quantise(rgb),
             metrics.whiten(views.images[i], views.masks[i]),
             views.ignored(i),
         )

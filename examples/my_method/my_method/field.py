@@ -1,10 +1,10 @@
 import torch
 from torch.nn.functional import grid_sample
 
-from visdom_plugin.methods import radiance
+from visdom_plugin.methods.fields import common
 from visdom_plugin.nerf.frame import frame_of
 from visdom_plugin.nerf.optimiser import FieldOptimiser
-from visdom_plugin.nerf.volume import composite, weights_from_density
+from visdom_plugin.nerf.rendering.volume import composite, weights_from_density
 
 
 class Field:
@@ -27,7 +27,7 @@ class Field:
     def trace(self, origins, directions, background, hooks, training=False):
         nearest = -(self.frame.to_local(origins) * directions).sum(-1).float()
         near, far = (nearest - self.radius).clamp_min(0), (nearest + self.radius).clamp_min(0)
-        o, d, near, far, hit = radiance.bound_rays(origins, directions, near, far, self.frame, hooks)
+        o, d, near, far, hit = common.bound_rays(origins, directions, near, far, self.frame, hooks)
         t = near[:, None] + (far - near)[:, None] * torch.linspace(0, 1, self.config.samples + 1).to(near)
         density, rgb = self.look(o[:, None] + (t[:, 1:] + t[:, :-1])[..., None] / 2 * d[:, None])
         weights = weights_from_density(density.reshape(len(t), -1), t)[0] * (hit | training)[:, None]
@@ -36,15 +36,15 @@ class Field:
     def train_step(self, batch, step):
         white = torch.ones(3, device=self.device)
         rgb, alpha, _ = self.trace(batch.origins, batch.directions, white, self.hooks, training=True)
-        colour = (rgb - radiance.photograph_on(white, batch, alpha)).square().mean()
-        return {"colour": colour, "mask": self.config.mask_weight * radiance.silhouette_loss(alpha, batch)}
+        colour = (rgb - common.photograph_on(white, batch, alpha)).square().mean()
+        return {"colour": colour, "mask": self.config.mask_weight * common.silhouette_loss(alpha, batch)}
 
     def optimise(self, step):
         self.optimiser.step(learning_rate=0.02)
 
     def render(self, camera, background):
         hooks = self.hooks if self.config.vd.hull_at_inference else []
-        return radiance.render_image(camera, lambda *x: self.trace(*x, background, hooks), self.frame, 20000)
+        return common.render_image(camera, lambda *x: self.trace(*x, background, hooks), self.frame, 20000)
 
     def state_dict(self):
         return self.optimiser.state_dict()
@@ -54,5 +54,5 @@ class Field:
 
     def export(self, folder):
         density, colour = lambda x: self.look(x)[0], lambda x, _: self.look(x)[1]
-        mesh = radiance.mesh_density(density, colour, self.frame, self.radius)
-        return radiance.export_mesh(folder / "mesh.ply", mesh)
+        mesh = common.mesh_density(density, colour, self.frame, self.radius)
+        return common.export_mesh(folder / "mesh.ply", mesh)

@@ -1,0 +1,136 @@
+"""What the pixels of mask files mean.
+
+A foreground mask is white (or opaque) on the object; what is outside is known to be empty. An ignore file is
+white where the photograph tells nothing. The two are different files in different folders and are never taken
+for one another.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from datamodules.files import images
+from visdom_plugin.errors import SceneError
+
+MOST_ENLARGED = 10
+"""A mask more than this many times wider than its image is refused before it is decoded."""
+_SOFT = (0.02, 0.98)
+_AGREED = 0.01
+
+
+class Mask(NamedTuple):
+    """A foreground mask as its file has it."""
+
+    opacity: np.ndarray
+    """(H, W) float32 in [0, 1]; above one half is object."""
+    soft: float
+    """Share of the pixels that are neither black nor white."""
+
+
+def fits(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes (width, height) are one picture at two resolutions, the smaller one's sides rounded."""
+    small, large = sorted((size, other))
+    low = max((s - 0.5) / o for s, o in zip(small, large, strict=True))
+    high = min((s + 0.5) / o for s, o in zip(small, large, strict=True))
+    return low <= high and max(size) <= MOST_ENLARGED * max(other)
+
+
+def decode(data: bytes, path: Path) -> Mask:
+    """A foreground mask from L, LA, RGB, RGBA, palette, 1-bit, 8-bit or 16-bit PNG or JPEG.
+
+    Its alpha channel is the mask where it varies, else its brightest colour channel is.
+
+    Raises:
+        SceneError: both could be, and they disagree.
+    """
+    pixels = images.decode_any(data, path)
+    alpha = alpha_of(pixels)
+    colour = pixels if pixels.ndim == 2 else pixels[..., : 3 if pixels.shape[2] >= 3 else 1].max(-1)
+    full = np.float32(np.iinfo(pixels.dtype).max)
+    colour = colour.astype(np.float32) / full
+    if alpha is None:
+        return _measured(colour)
+    alpha = alpha.astype(np.float32) / full
+    # A cut-out's colours are a photograph; only colours that are black and white could be meant as a mask.
+    if colour.min() != colour.max() and soft_share(colour) < _AGREED and _differ(colour, alpha):
+        raise SceneError(
+            "the mask's colours and its alpha channel are two different masks",
+            where=path,
+            cause="a mask that was saved with an alpha channel of another one",
+            todo="save it as a grey image without alpha channel",
+        )
+    return _measured(alpha)
+
+
+def decode_alpha(pixels: np.ndarray) -> Mask | None:
+    """The alpha channel of a photograph (H, W, C) as its mask; None where it has none or it is all the same."""
+    alpha = alpha_of(pixels)
+    return None if alpha is None else _measured(alpha.astype(np.float32) / np.iinfo(pixels.dtype).max)
+
+
+def alpha_of(pixels: np.ndarray) -> np.ndarray | None:
+    """(H, W) alpha channel where there is one and it varies, else None."""
+    if pixels.ndim != 3 or pixels.shape[2] not in (2, 4):
+        return None
+    alpha = pixels[..., -1]
+    return None if alpha.min() == alpha.max() else alpha
+
+
+def refuse_two(file: Mask, alpha: Mask, file_path: Path, image_path: Path) -> None:
+    """Raises SceneError where a mask's file and the photograph's alpha channel disagree."""
+    one, other = file.opacity, alpha.opacity
+    if one.shape != other.shape:
+        one = images.shrink_nearest(one, other.shape[1], other.shape[0])
+    if _differ(one, other):
+        raise SceneError(
+            f"two masks that disagree: the file {file_path.name} and the alpha channel of {image_path.name}",
+            where=f"{file_path} and {image_path}",
+            todo="say which one is meant: --data.mask-source folder, or --data.mask-source alpha",
+        )
+
+
+def refuse_empty(mask: np.ndarray, peak: float, path: Path) -> None:
+    """Raises SceneError, with the likely cause, for a mask without foreground.
+
+    Args:
+        mask: (H, W) bool.
+        peak: the largest opacity in the file.
+    """
+    if mask.any():
+        return
+    if 0 < peak < 0.02:
+        cause, todo = (
+            "the mask holds 0 and 1 where 0 and 255 are meant, or 8-bit values in a 16-bit file",
+            "multiply the masks by 255, or save them with 8 bits",
+        )
+    elif 0.02 <= peak <= 0.5:
+        cause, todo = (
+            f"the mask's brightest value is {round(peak * 255)} of 255, and only what is above one half is object",
+            "save the masks with 0 and 255",
+        )
+    elif peak > 0.5:
+        cause, todo = "the object is thinner than a pixel at this size", "use a smaller --downscale"
+    else:
+        cause, todo = (
+            "the segmentation found nothing in this view",
+            "mask the object, drop the view, or remove the file and pass --data.missing-masks colour|hull",
+        )
+    raise SceneError("the mask is empty: no pixel of it is foreground", where=path, cause=cause, todo=todo)
+
+
+def soft_share(opacity: np.ndarray) -> float:
+    """Share of the pixels that are neither black nor white."""
+    return float(((opacity > _SOFT[0]) & (opacity < _SOFT[1])).mean())
+
+
+def _measured(opacity: np.ndarray) -> Mask:
+    return Mask(opacity, soft_share(opacity))
+
+
+def _differ(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two opacities, cut at one half, differ by more than 1 % of what either covers."""
+    a, b = one > 0.5, other > 0.5
+    return int((a ^ b).sum()) > _AGREED * int((a | b).sum())

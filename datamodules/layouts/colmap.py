@@ -1,0 +1,103 @@
+"""Folders with a COLMAP model in general, and what all layouts with such a model share.
+
+sparse/0, sparse, colmap/sparse/0, dense/sparse or the folder itself   the model, text or binary
+images/ or images_<F>/                  photographs, F times smaller in the latter
+masks/                                  foreground masks, named after the photographs; or alpha channels
+
+Every 8th view by name is for testing and training views are spread evenly over the others, unless index files
+or lists say otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+from datamodules.files import colmap_model
+from datamodules.files.paths import check_name, stem
+from datamodules.open_scene import Calibration, Capture, Frame, sort_frames
+from datamodules.request import Request
+from datamodules.views import splits
+from visdom_plugin.errors import SceneError
+
+
+def recognise(root: Path) -> str | None:
+    """What makes the folder look like this layout, or None."""
+    folder = colmap_model.find_model(root)
+    # Programs that write transforms.json leave the model it was made from in these places.
+    if folder in ("colmap/sparse/0", "colmap_sparse/0") and (root / "transforms.json").exists():
+        return None
+    return None if folder is None else f"a COLMAP model in {folder or 'the folder itself'}"
+
+
+def read(root: Path, request: Request) -> Capture:
+    """Reads the model; every 8th view is for testing.
+
+    Raises:
+        SceneError: there is no readable model.
+    """
+    return read_capture(root, request, "colmap")
+
+
+def read_capture(
+    root: Path,
+    request: Request,
+    layout: str,
+    *,
+    folder: str | None = None,
+    indexed: bool = False,
+    mask_folder: str = "masks",
+    depths: str | None = None,
+    notes: Sequence[str] = (),
+) -> Capture:
+    """A capture of a COLMAP model and a folder `images`.
+
+    Args:
+        folder: of the model below the root; None looks in the usual places.
+        indexed: whether index files are demanded.
+        depths: folder of monocular depth maps, where the layout has one.
+    """
+    if folder is None:
+        folder = colmap_model.find_model(root)
+    if folder is None:
+        raise SceneError(
+            "there is no COLMAP model in this folder",
+            where=root,
+            todo="put cameras.bin and images.bin (or the .txt pair) into sparse/0",
+        )
+    model = colmap_model.read_model(root, folder, outside=request.allow_outside)
+    for image in model.images:
+        check_name(image.name, model.folder, outside=request.allow_outside)
+    registered = {image.name: image for image in model.images}
+    if len(registered) < len(model.images):
+        names = sorted(image.name for image in model.images)
+        twice = next(a for a, b in pairwise(names) if a == b)
+        raise SceneError(
+            f"two registered images share the name {stem(twice)}: {twice} is listed twice",
+            where=model.folder,
+            cause="two models merged into one, or a damaged file",
+            todo="export the model again",
+        )
+    frames = sort_frames(
+        [
+            Frame(name, f"images/{name}", depth=None if depths is None else f"{depths}/{stem(name)}.png")
+            for name in registered
+        ]
+    )
+
+    def calibrate(wanted: Sequence[int]) -> Calibration:
+        return Calibration(*colmap_model.cameras_of(model, [registered[frames[i].name] for i in wanted]))
+
+    return Capture(
+        root,
+        layout,
+        frames,
+        calibrate,
+        splits.every_eighth(len(frames)),
+        model.files,
+        indexed=indexed,
+        photographs="images",
+        mask_folder=mask_folder,
+        notes=tuple(notes),
+    )

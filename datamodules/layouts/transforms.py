@@ -1,0 +1,320 @@
+"""transforms.json of Blender's NeRF scenes, nerfstudio and instant-ngp.
+
+transforms.json                            one file (nerfstudio, instant-ngp)
+transforms_{train,test}.json               or one per split (Blender); transforms_val.json is not used
+<file_path>                                photographs, with or without their extension
+masks/                                     foreground masks named after the photographs; or alpha channels
+
+Poses are camera-to-world with OpenGL axes (x right, y up, z backward), and stay in the file's world frame:
+`scale`, `offset` and `aabb_scale` of instant-ngp say how that program places the scene in its own box, and
+`applied_transform` of nerfstudio what was done to COLMAP's frame before. Angles and focal lengths after the
+formats' documentation; the principal point has its origin at the image's corner, as everywhere here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from datamodules.files import images
+from datamodules.files.parsers import damaged, matrix, number, parse_json, size, text
+from datamodules.files.paths import check_name, inside, printable, read_inside
+from datamodules.files.undistort import Distortion
+from datamodules.open_scene import Calibration, Capture, Frame, pinholes, sort_frames
+from datamodules.request import Request
+from datamodules.views import splits
+from visdom_plugin.errors import SceneError
+
+_PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
+_LENS = ("x_fov", "y_fov", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy")
+_BENT = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One frame of a file, checked but for what its image decides."""
+
+    file_path: str
+    pose: list[list[float]]
+    """3 x 4 camera to world, OpenGL axes."""
+    own: dict[str, float]
+    """Lens numbers given for this frame."""
+    size: tuple[int, int] | None
+    distortion: Distortion | None
+    mask_path: str | None = None
+    depth_path: str | None = None
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """One file: its lens for all frames, its frames, and the file names of its splits."""
+
+    path: Path
+    shared: dict[str, float]
+    entries: tuple[Entry, ...]
+    train: tuple[str, ...] | None = None
+    test: tuple[str, ...] | None = None
+
+
+def recognise(root: Path) -> str | None:
+    """transforms.json, or None."""
+    return "transforms.json" if (root / "transforms.json").exists() else None
+
+
+def recognise_blender(root: Path) -> str | None:
+    """transforms_train.json, or None."""
+    return "transforms_train.json" if (root / "transforms_train.json").exists() else None
+
+
+def read(root: Path, request: Request) -> Capture:
+    """Reads transforms.json; without lists of its own every 8th view is for testing."""
+    file = read_transforms(root, "transforms.json", request)
+    return make_capture(root, request, "nerfstudio", [file])
+
+
+def read_blender(root: Path, request: Request) -> Capture:
+    """Reads transforms_train.json and, where it is there, transforms_test.json."""
+    names = ["transforms_train.json"]
+    if inside(root, "transforms_test.json", outside=request.allow_outside).exists():
+        names.append("transforms_test.json")
+    return make_capture(root, request, "blender", [read_transforms(root, name, request) for name in names])
+
+
+def read_transforms(root: Path, name: str, request: Request) -> Transforms:
+    """One file of the scene, checked."""
+    return parse_transforms(read_inside(root, name, outside=request.allow_outside, most=2**28), root / name)
+
+
+def parse_transforms(data: bytes, path: Path) -> Transforms:
+    """Checks types, numbers and matrices of a file; opens no other.
+
+    Raises:
+        SceneError: for everything that is not as the formats say.
+    """
+    content = parse_json(data, path)
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        damaged(
+            path, f"{path.name} lists no frames", cause="another kind of file, or a capture without images"
+        )
+    entries = tuple(_entry(frame, i, content, path) for i, frame in enumerate(frames))
+    lists = {}
+    for key in ("train_filenames", "test_filenames"):
+        value = content.get(key)
+        if value is not None and not isinstance(value, list):
+            damaged(path, f"{key} is no list of names")
+        lists[key] = None if value is None else tuple(_normalise(text(v, key, path)) for v in value)
+    return Transforms(path, _numbers(content, _LENS, path), entries, *lists.values())
+
+
+def _entry(frame: Any, index: int, content: dict[str, Any], path: Path) -> Entry:
+    if not isinstance(frame, dict):
+        damaged(path, f"frame {index} is no object")
+    what = f"of frame {index}"
+    if "transform_matrix" not in frame and "transform_matrix_start" in frame:
+        damaged(
+            path,
+            f"frame {index} has a rolling shutter, which cannot be used",
+            cause="a video, not photographs",
+        )
+    dimensions = [frame.get(key, content.get(key)) for key in ("w", "h")]
+    if (dimensions[0] is None) != (dimensions[1] is None):
+        damaged(path, f"only one of w and h {what} is given")
+    given = {key: frame.get(key) for key in ("mask_path", "depth_file_path")}
+    return Entry(
+        _normalise(text(frame.get("file_path"), f"file_path {what}", path)),
+        matrix(frame.get("transform_matrix"), f"transform_matrix {what}", path),
+        _numbers(frame, _LENS, path),
+        None if dimensions[0] is None else tuple(size(d, f"w or h {what}", path) for d in dimensions),
+        _distortion(content | frame, what, path),
+        *(
+            None if value is None else _normalise(text(value, f"{key} {what}", path))
+            for key, value in given.items()
+        ),
+    )
+
+
+def _numbers(scope: dict[str, Any], keys: Sequence[str], path: Path) -> dict[str, float]:
+    return {key: number(scope[key], key, path) for key in keys if scope.get(key) is not None}
+
+
+def _normalise(name: str) -> str:
+    name = name.replace("\\", "/")
+    while name.startswith("./"):
+        name = name[2:]
+    return name
+
+
+def _distortion(scope: dict[str, Any], what: str, path: Path) -> Distortion | None:
+    """The lens model in COLMAP's terms; nerfstudio's k4 of OPENCV multiplies r^8, which OpenCV has not."""
+    model = scope.get("camera_model", "OPENCV_FISHEYE" if scope.get("is_fisheye") is True else "OPENCV")
+    k = {
+        key: number(scope[key], f"{key} {what}", path) if scope.get(key) is not None else 0.0 for key in _BENT
+    }
+    if model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return None
+    if model in ("OPENCV_FISHEYE", "FISHEYE"):
+        return Distortion("OPENCV_FISHEYE", (k["k1"], k["k2"], k["k3"], k["k4"]))
+    if model not in ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE"):
+        raise SceneError(
+            f"camera_model {what} is {model!r:.60}, which cannot be undistorted here",
+            where=path,
+            cause="an unusual lens, or a damaged file",
+            todo="undistort the photographs and give camera_model PINHOLE",
+        )
+    if k["k4"]:
+        raise SceneError(
+            f"k4 {what} is {k['k4']:g}: this radial term has no counterpart in OpenCV's model",
+            where=path,
+            cause="a fisheye lens without camera_model OPENCV_FISHEYE, or a calibration by another program",
+            todo="undistort the photographs and remove the coefficients",
+        )
+    short = (k["k1"], k["k2"], k["p1"], k["p2"])
+    if k["k3"]:
+        return Distortion("FULL_OPENCV", (*short, k["k3"], 0.0, 0.0, 0.0))
+    return Distortion("OPENCV", short) if any(short) else None
+
+
+def make_capture(
+    root: Path,
+    request: Request,
+    layout: str,
+    files: Sequence[Transforms],
+    *,
+    rename: Callable[[str], str] | None = None,
+) -> Capture:
+    """The capture of one or more files: of two, the second holds the test views.
+
+    Args:
+        rename: from a file_path to the photograph's path below the root, for layouts that have a rule.
+    """
+    of_name: dict[str, tuple[Transforms, Entry, int]] = {}
+    frames = []
+    for part, file in enumerate(files):
+        for entry in file.entries:
+            name = (rename or (lambda p: _find_photograph(root, p, request)))(entry.file_path)
+            check_name(name, file.path, outside=request.allow_outside)
+            if name in of_name:
+                damaged(file.path, f"{printable(name)} is listed twice", cause="two captures merged into one")
+            of_name[name] = file, entry, part
+            frames.append(_frame(root, name, entry, request))
+    ordered = sort_frames(frames)
+    pools, notes = _pools(ordered, of_name, files), []
+    if any(frame.ignore for frame in ordered):
+        notes.append("mask_path means pixels to ignore, as in nerfstudio, not the object's outline")
+    # mask_path may point into the folder masks: these files are then no foreground masks.
+    pointed = any(entry.mask_path for file in files for entry in file.entries)
+
+    def calibrate(wanted: Sequence[int]) -> Calibration:
+        lenses = [_lens(root, ordered[i], *of_name[ordered[i].name][:2], request) for i in wanted]
+        entries = [of_name[ordered[i].name][1] for i in wanted]
+        cameras = pinholes(
+            [K for K, _ in lenses],
+            [entry.pose for entry in entries],
+            [dimensions for _, dimensions in lenses],
+            names=[ordered[i].name for i in wanted],
+            where=files[0].path,
+            convention="opengl",
+        )
+        return Calibration(cameras, [entry.distortion for entry in entries])
+
+    return Capture(
+        root,
+        layout,
+        ordered,
+        calibrate,
+        pools,
+        tuple(file.path.name for file in files),
+        photographs="images" if all(f.image.startswith("images/") for f in ordered) else None,
+        mask_folder=None if pointed else "masks",
+        notes=tuple(notes),
+    )
+
+
+def _find_photograph(root: Path, file_path: str, request: Request) -> str:
+    """The photograph's path below the root: extensions may be left out."""
+    if PurePosixPath(file_path).suffix.lower() in _PHOTOGRAPHS:
+        return file_path
+    check_name(file_path, root, outside=request.allow_outside)
+    ends = (*_PHOTOGRAPHS, *(end.upper() for end in _PHOTOGRAPHS))
+    found = [file_path + end for end in ends if (root / (file_path + end)).exists()]
+    return found[0] if found else file_path + ".png"
+
+
+def _frame(root: Path, name: str, entry: Entry, request: Request) -> Frame:
+    """With the side files that instant-ngp knows: <name>.alpha.<ext> and dynamic_mask_<name>.png."""
+    path = PurePosixPath(name)
+    alpha = str(path.with_suffix(f".alpha{path.suffix}"))
+    dynamic = str(path.with_name(f"dynamic_mask_{path.stem}.png"))
+    frame = Frame(name, name, depth=entry.depth_path)
+    if (root / alpha).is_file():
+        frame = replace(frame, mask=alpha)
+    if (root / dynamic).is_file():
+        frame = replace(frame, excluded=dynamic)
+    if entry.mask_path is not None:
+        frame = replace(frame, **{"mask" if request.mask_path == "foreground" else "ignore": entry.mask_path})
+    return frame
+
+
+def _pools(frames: Sequence[Frame], of_name: dict, files: Sequence[Transforms]) -> splits.Pools:
+    if len(files) > 1:
+        test = tuple(i for i, frame in enumerate(frames) if of_name[frame.name][2] == 1)
+        rule = f"{files[0].path.name} and {files[1].path.name}"
+    elif files[0].test is not None:
+        listed = set(files[0].test)
+        test = tuple(i for i, frame in enumerate(frames) if of_name[frame.name][1].file_path in listed)
+        rule = "test_filenames"
+    else:
+        return splits.every_eighth(len(frames))
+    held = set(test)
+    train = [i for i in range(len(frames)) if i not in held]
+    if len(files) == 1 and files[0].train is not None:
+        listed = set(files[0].train)
+        train = [i for i in train if of_name[frames[i].name][1].file_path in listed]
+    return splits.Pools(tuple(train), test, rule)
+
+
+def _lens(root: Path, frame: Frame, file: Transforms, entry: Entry, request: Request):
+    """(fx, fy, cx, cy) in pixels and (width, height); the size is the photograph's where none is given."""
+    dimensions = entry.size
+    if dimensions is None:
+        path = inside(root, frame.image, outside=request.allow_outside)
+        dimensions = images.size_of(images.read_file(path), path)
+    both = {**file.shared, **entry.own}
+    focal = _focal(entry.own, dimensions) or _focal(file.shared, dimensions)
+    if focal is None:
+        damaged(
+            file.path,
+            f"there is no focal length for {printable(frame.name)}: none of fl_x, camera_angle_x, x_fov",
+            cause="a file of another kind",
+        )
+    return (*focal, both.get("cx", dimensions[0] / 2), both.get("cy", dimensions[1] / 2)), dimensions
+
+
+def _focal(scope: dict[str, float], dimensions: tuple[int, int]) -> tuple[float, float] | None:
+    """Focal lengths in pixels; where one axis is given it serves both."""
+
+    def of_angle(angle: float, pixels: int) -> float:
+        # An angle of 0 or 180 degrees and beyond is no field of view; 0 is refused as a focal length later.
+        return 0.5 * pixels / math.tan(angle / 2) if 0 < angle < math.pi else 0.0
+
+    for keys, radians in (
+        (("x_fov", "y_fov"), math.pi / 180),
+        (("fl_x", "fl_y"), None),
+        (("camera_angle_x", "camera_angle_y"), 1.0),
+    ):
+        found = [
+            None
+            if key not in scope
+            else scope[key]
+            if radians is None
+            else of_angle(scope[key] * radians, pixels)
+            for key, pixels in zip(keys, dimensions, strict=True)
+        ]
+        if found != [None, None]:
+            fx, fy = found
+            return (fy if fx is None else fx), (fx if fy is None else fy)
+    return None

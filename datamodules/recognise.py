@@ -1,0 +1,207 @@
+"""The one door to data: recognises a folder's layout and loads it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from datamodules.request import Request
+from visdom_plugin.errors import ConfigError, SceneError
+
+if TYPE_CHECKING:
+    from datamodules.open_scene import Capture
+    from visdom_plugin.scene import Scene
+
+log = logging.getLogger(__name__)
+
+
+class _Format(NamedTuple):
+    module: str
+    holds: str
+    """What a folder of this layout holds, for people."""
+    covers: tuple[str, ...] = ()
+    """Layouts whose marks are part of this one, so that finding both is no ambiguity."""
+    reader: str = "read"
+    recogniser: str | None = "recognise"
+    """None for a layout that has to be asked for."""
+
+
+FORMATS = {
+    "prepared": _Format(
+        "prepared", "sparse/0 (COLMAP model), images, masks, sparse_<N>.txt", ("colmap", "mip360", "llff")
+    ),
+    "mip360": _Format("mip360", "sparse/0, images and images_<F>, masks", ("colmap", "llff")),
+    "omni3d": _Format(
+        "omni3d",
+        "render/ with transforms.json, or standard/ with matting",
+        ("colmap", "mip360", "llff", "nerfstudio"),
+    ),
+    "omni3d-llff": _Format("omni3d", "the same, with its LLFF poses", reader="read_llff", recogniser=None),
+    "actorshq": _Format("actorshq", "1x, 2x or 4x with calibration.csv, rgbs and masks"),
+    "nerfstudio": _Format("transforms", "transforms.json"),
+    "instant-ngp": _Format("transforms", "transforms.json", recogniser=None),
+    "blender": _Format(
+        "transforms", "transforms_train.json", reader="read_blender", recogniser="recognise_blender"
+    ),
+    "colmap": _Format("colmap", "a COLMAP model and images"),
+    "llff": _Format("llff", "poses_bounds.npy and images"),
+}
+"""Names for --data-format."""
+
+
+def load(
+    path: str | Path | None,
+    *,
+    views: int | None = None,
+    downscale: float = 1,
+    seed: int = 0,
+    test: bool = True,
+    data_format: str | None = None,
+    **reading: Any,
+) -> Scene:
+    """Opens a scene.
+
+    Args:
+        path: the scene's folder; None is the built-in scene.
+        views: number of training views; None takes the smallest index file, or 4.
+        downscale: >= 1, how much smaller than the photographs to work.
+        seed: of the built-in scene's noise; real data does not depend on it.
+        test: False leaves the test views out, for callers that do not evaluate.
+        data_format: the layout, one of `FORMATS`; None recognises it.
+        reading: further fields of `request.Request`; the built-in scene does not use them.
+
+    Returns:
+        Scene with train and test views, cameras float64 on the CPU.
+
+    Raises:
+        SceneError: for every fault of the data, a missing folder, and an unknown or ambiguous layout.
+        ConfigError: for an option out of range.
+    """
+    request = Request(views=views, downscale=downscale, test=test, **reading)
+    _check_format(data_format)
+    if path is None:
+        from datamodules.synthetic.scene import SyntheticConfig, make_scene
+
+        wanted = {} if views is None else {"train_views": views}
+        return make_scene(
+            SyntheticConfig(downscale=downscale, seed=seed, **wanted, **({} if test else {"test_views": 0}))
+        )
+    from datamodules.open_scene import open_capture
+
+    with opening(path) as root:
+        return open_capture(read_capture(root, data_format, request), request)
+
+
+@contextmanager
+def opening(path: str | Path) -> Iterator[Path]:
+    """The folder of that name; what goes wrong while it is read is told as SceneError."""
+    root = find_folder(path)
+    try:
+        yield root
+    except RecursionError as error:
+        raise SceneError("the data is nested too deeply", where=root) from error
+    except OSError as error:
+        raise SceneError(
+            f"the scene cannot be read: {error.strerror or error}",
+            where=error.filename or root,
+            todo="make its files plain files that you may read",
+        ) from error
+
+
+def find_folder(path: str | Path) -> Path:
+    """The folder of that name.
+
+    Raises:
+        SceneError: there is none.
+    """
+    root = Path(path)
+    try:
+        root = root.expanduser()
+        exists, is_folder = root.exists(), root.is_dir()
+    except (OSError, ValueError, RuntimeError):
+        exists = is_folder = False
+    if not is_folder:
+        raise SceneError(
+            "this is a file, not a folder" if exists else "there is no such folder",
+            where=root,
+            todo="pass --data with the folder of a scene, or leave it out for the built-in scene",
+        )
+    return root
+
+
+def recognise(root: Path) -> dict[str, str]:
+    """The layouts that a folder could have, each with what speaks for it. More than one is ambiguous."""
+    found = {}
+    for name, form in FORMATS.items():
+        if form.recogniser is not None:
+            reason = getattr(import_module(f"datamodules.layouts.{form.module}"), form.recogniser)(root)
+            if reason is not None:
+                found[name] = reason
+    covered = {name for other in found for name in FORMATS[other].covers}
+    return {name: reason for name, reason in found.items() if name not in covered}
+
+
+def read_capture(root: Path, data_format: str | None, request: Request) -> Capture:
+    """What the layout's reader makes of the folder, before any pixel is read.
+
+    Args:
+        data_format: the layout; None recognises it.
+
+    Raises:
+        SceneError: for an unknown or ambiguous layout, and for a calibration that is damaged.
+        ConfigError: for an option out of range.
+    """
+    _check_format(data_format)
+    request.check()
+    if data_format is None:
+        data_format = _only_reading(root)
+    form = FORMATS[data_format]
+    read: Callable[[Path, Request], Capture] = getattr(
+        import_module(f"datamodules.layouts.{form.module}"), form.reader
+    )
+    return read(root, request)
+
+
+def _check_format(data_format: str | None) -> None:
+    if data_format is not None and data_format not in FORMATS:
+        raise ConfigError(
+            f"unknown data format {data_format!r}", where="--data-format", todo=f"one of {', '.join(FORMATS)}"
+        )
+
+
+def _only_reading(root: Path) -> str:
+    found = recognise(root)
+    if len(found) == 1:
+        ((name, reason),) = found.items()
+        log.info("%s: read as %s, because of %s", root, name, reason)
+        return name
+    if found:
+        raise SceneError(
+            "this folder can be read in more than one way: "
+            + " or ".join(f"{name} ({reason})" for name, reason in found.items()),
+            where=root,
+            todo=f"say which one is meant: --data-format {' or --data-format '.join(found)}",
+        )
+    layouts = "; ".join(f"{name}: {form.holds}" for name, form in FORMATS.items() if form.recogniser)
+    raise SceneError(
+        "this folder is not a scene of a known layout",
+        where=root,
+        cause=_guess(root),
+        todo=f"pass a folder of one of these layouts, or name it with --data-format. {layouts}",
+    )
+
+
+def _guess(root: Path) -> str:
+    inside = [p for p in sorted(root.iterdir()) if p.is_dir()]
+    for folder in inside:
+        if recognise(folder):
+            return f"one level too high: {folder} looks like a scene"
+    if root.name in ("images", "masks", "sparse", "0", "rgbs", "matting"):
+        return "one level too deep: the scene is the folder above"
+    return (
+        "it holds none of the files that the layouts are known by" if any(root.iterdir()) else "it is empty"
+    )

@@ -1,0 +1,293 @@
+"""The built-in scene: a watering can on a table, drawn on the fly, with exact masks and an exact mesh.
+
+It is hard where the visible domain matters: off-centre, not of unit size, thin (the bail), hollow, with holes
+behind the handle and under the bail, and taken by cameras of different distance, aim, field of view and
+principal point, some of which cut a piece off, so that the hull depends on K.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from visdom_plugin.errors import ConfigError
+
+if TYPE_CHECKING:
+    from visdom_plugin.scene import Scene
+
+_MOST_VIEWS = 16
+_CENTRE = (1.7, -0.9, 0.6)
+_SCALE = 1.3
+_YAW = 0.6
+_MIDDLE = (0.13, 0.0, 0.66)
+_SAMPLES = 3
+# Training cameras: azimuth and elevation (degrees), distance (in shapes' units), field of view (degrees), aim
+# off the object's middle (right, up; in half images) and principal point off the image's centre (in images).
+# Any first few are well spread.
+_TRAIN = (
+    (20, 16, 3.3, 29, 0.02, -0.16, 0.03, -0.02),
+    (200, 38, 4.4, 27, -0.12, 0.00, -0.02, 0.02),
+    (112, 24, 2.9, 41, 0.26, 0.00, 0.00, 0.03),
+    (285, 47, 3.9, 27, 0.34, 0.05, 0.04, 0.00),
+    (65, 55, 4.8, 24, -0.05, 0.04, -0.03, -0.03),
+    (245, 12, 3.0, 40, 0.02, 0.10, 0.02, 0.02),
+    (155, 9, 4.1, 29, -0.25, 0.02, -0.01, 0.00),
+    (330, 30, 3.5, 36, -0.08, -0.05, 0.02, -0.04),
+    (10, 66, 4.3, 30, 0.05, 0.00, 0.00, 0.02),
+    (180, 14, 3.2, 38, 0.00, 0.08, 0.03, 0.00),
+    (90, 6, 3.7, 34, -0.10, 0.04, -0.04, 0.02),
+    (270, 28, 4.6, 27, 0.06, -0.04, 0.00, -0.02),
+    (45, 34, 3.1, 41, 0.03, 0.02, 0.02, 0.03),
+    (225, 58, 3.6, 34, 0.00, 0.00, -0.02, 0.00),
+    (135, 42, 4.9, 25, -0.04, 0.03, 0.01, -0.01),
+    (312, 18, 3.4, 37, 0.08, 0.06, 0.00, 0.04),
+)
+
+
+@dataclass(frozen=True)
+class SyntheticConfig:
+    """The built-in scene's knobs. Noise goes to the training views only; test views stay exact."""
+
+    size: int | tuple[int, int] = 200
+    """Width and height of the photographs in pixels before `downscale`; one number for a square."""
+    train_views: int = 4
+    """2 to 16; fewer views are the first of more."""
+    test_views: int = 16
+    """0 or more."""
+    downscale: float = 1.0
+    """>= 1: the photographs come out at round(size / downscale)."""
+    rotation_noise_deg: float = 0.0
+    """Standard deviation of the error in each training camera's orientation."""
+    translation_noise: float = 0.0
+    """Standard deviation of the error in each training camera's position, as a fraction of its distance."""
+    erode_px: int = 0
+    """Training masks lose this many pixels at their edges."""
+    dilate_px: int = 0
+    """Training masks gain this many pixels at their edges, after the erosion."""
+    flip_fraction: float = 0.0
+    """Fraction of the training masks' pixels that are turned over at random."""
+    truncation: float = 0.0
+    """In [0, 1): every other training view is shifted sideways until about this fraction of the object's
+    width lies outside the frame."""
+    background: Literal["room", "white", "black"] = "room"
+    """What the photographs show behind the object."""
+    seed: int = 0
+    """Of the noise."""
+
+    @property
+    def frame(self) -> tuple[int, int]:
+        """Width and height in pixels, after `downscale`."""
+        size = (self.size, self.size) if isinstance(self.size, int) else self.size
+        width, height = (max(1, round(s / self.downscale)) for s in size)
+        return width, height
+
+    def check(self) -> None:
+        """Raises ConfigError for a field out of its range."""
+        downscale_fine = math.isfinite(self.downscale) and self.downscale >= 1
+        checks = (
+            ("downscale", downscale_fine, "1 or more"),
+            (
+                "size",
+                not downscale_fine or 8 <= min(self.frame) <= max(self.frame) <= 8192,
+                "8 to 8192 pixels",
+            ),
+            ("train_views", 2 <= self.train_views <= _MOST_VIEWS, f"2 to {_MOST_VIEWS}"),
+            ("test_views", 0 <= self.test_views <= 360, "0 to 360"),
+            ("rotation_noise_deg", 0 <= self.rotation_noise_deg <= 180, "0 to 180"),
+            ("translation_noise", 0 <= self.translation_noise <= 1, "0 to 1"),
+            ("erode_px", 0 <= self.erode_px <= 1000, "0 to 1000"),
+            ("dilate_px", 0 <= self.dilate_px <= 1000, "0 to 1000"),
+            ("flip_fraction", 0 <= self.flip_fraction <= 1, "0 to 1"),
+            ("truncation", 0 <= self.truncation < 1, "0 to less than 1"),
+            ("background", self.background in ("room", "white", "black"), "room, white or black"),
+        )
+        for name, fine, allowed in checks:
+            if not fine:
+                raise ConfigError(
+                    f"the built-in scene's {name} is {getattr(self, name)!r}; it must be {allowed}",
+                    where=name,
+                )
+
+
+def make_scene(config: SyntheticConfig | None = None) -> Scene:
+    """Draws the built-in scene; the same pictures, bit for bit, for the same config.
+
+    Returns:
+        Scene with `mesh` set: the exact surface in the world frame. Masks are the exact silhouettes at pixel
+        centres before noise.
+
+    Raises:
+        ConfigError: a field of the config is out of range.
+    """
+    from dataclasses import asdict
+
+    import torch
+
+    from datamodules.open_scene import hash_views
+    from datamodules.synthetic.noise import disturb_masks, disturb_poses
+    from datamodules.synthetic.shape import watering_can
+    from visdom_plugin.geometry.cameras import Cameras
+    from visdom_plugin.scene import Scene, Views
+
+    config = config or SyntheticConfig()
+    config.check()
+    shape = watering_can()
+    cameras = Cameras.stack([_camera(config, row) for row in _rows(config)])
+    if config.truncation:
+        cameras = _truncate(config, cameras, shape)
+    pictures = _draw(config, cameras, shape)
+    n = config.train_views
+
+    def views(part: slice, prefix: str, poses: Cameras, masks) -> Views:
+        names = tuple(f"{prefix}_{i:03d}" for i in range(len(poses)))
+        return Views(poses, tuple(p[0] for p in pictures[part]), tuple(masks), names)
+
+    masks = disturb_masks([p[1] for p in pictures[:n]], config)
+    train = views(slice(0, n), "train", disturb_poses(cameras[:n], config), masks)
+    test = views(slice(n, None), "test", cameras[n:], [p[1] for p in pictures[n:]])
+    source = {
+        "root": "built-in",
+        "layout": "synthetic",
+        "views": n,
+        "downscale": float(config.downscale),
+        "config": asdict(config),
+        "train": list(train.names),
+        "test": list(test.names),
+        "hashes": hash_views(train),
+    }
+    vertices = torch.from_numpy(to_world(shape.vertices))
+    return Scene("built-in", train, test, "unknown", source, mesh=(vertices, torch.from_numpy(shape.faces)))
+
+
+def to_world(points):
+    """Points (..., 3) of the shape's frame in the world frame: turned, scaled and moved off the origin."""
+    import numpy as np
+
+    c, s = math.cos(_YAW), math.sin(_YAW)
+    local = np.asarray(points) - np.array(_MIDDLE)
+    x, y, z = local[..., 0], local[..., 1], local[..., 2]
+    turned = np.stack([c * x - s * y, s * x + c * y, z], -1)
+    return _SCALE * turned + np.array(_CENTRE)
+
+
+def _rows(config: SyntheticConfig) -> list[tuple]:
+    # Test cameras wind round the object; the golden angle keeps any number of them evenly spread.
+    golden = 180 * (3 - math.sqrt(5))
+    test = []
+    for i in range(config.test_views):
+        height = (i + 0.5) / config.test_views
+        test.append((33 + golden * i, 8 + 52 * height, 3.9 + 0.5 * math.cos(2.4 * i), 35, 0, 0, 0, 0))
+    return [*_TRAIN[: config.train_views], *test]
+
+
+def _camera(config: SyntheticConfig, row: tuple):
+    import torch
+
+    from visdom_plugin.geometry.cameras import Cameras, look_at_camera
+
+    azimuth, elevation, distance, view, right, up, shift_x, shift_y = row
+    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
+    direction = torch.tensor(
+        [
+            math.cos(elevation) * math.cos(azimuth),
+            math.cos(elevation) * math.sin(azimuth),
+            math.sin(elevation),
+        ],
+        dtype=torch.float64,
+    )
+    middle = torch.tensor(_CENTRE, dtype=torch.float64)
+    vertical = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    centre = middle + _SCALE * distance * direction
+    straight = look_at_camera(centre, middle, vertical)
+    half = _SCALE * distance * math.tan(math.radians(view) / 2)
+    aim = middle + half * (right * straight[:3, 0] - up * straight[:3, 1])
+    width, height = config.frame
+    focal = 0.5 * min(width, height) / math.tan(math.radians(view) / 2)
+    K = [[focal, 0, width * (0.5 + shift_x)], [0, focal, height * (0.5 + shift_y)], [0, 0, 1]]
+    return Cameras.from_matrices(
+        torch.tensor(K, dtype=torch.float64),
+        look_at_camera(centre, aim, vertical),
+        width=width,
+        height=height,
+    )
+
+
+def _truncate(config: SyntheticConfig, cameras, shape):
+    import torch
+
+    from visdom_plugin.geometry.cameras import Cameras, project
+
+    uv, _ = project(cameras, torch.from_numpy(to_world(shape.vertices)))
+    left, right = uv[..., 0].amin(-1), uv[..., 0].amax(-1)
+    # Even views lose their right-hand side, and so on in turn; the object slides out over the frame's edge.
+    shift = cameras.width + config.truncation * (right - left) - right
+    other = -config.truncation * (right - left) - left
+    index = torch.arange(len(cameras))
+    shift = torch.where(index % 4 == 1, shift, other) * ((index % 2 == 1) & (index < config.train_views))
+    K = cameras.intrinsics.clone()
+    K[:, 0, 2] += shift
+    return Cameras(K, cameras.world_from_camera, cameras.width, cameras.height)
+
+
+def _draw(config: SyntheticConfig, cameras, shape) -> list[tuple]:
+    """(image, mask) of every camera, as tensors."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(lambda i: _photograph(config, cameras[i], shape), range(len(cameras))))
+
+
+def _photograph(config: SyntheticConfig, camera, shape) -> tuple:
+    import numpy as np
+    import torch
+
+    from datamodules.synthetic.paint import paint_object, paint_room
+    from datamodules.synthetic.render import rasterise
+
+    s, width, height = _SAMPLES, int(camera.width), int(camera.height)
+    K, motion = camera.intrinsics.numpy(), camera.world_from_camera.numpy()
+    away = to_world(shape.vertices) - motion[:3, 3]
+    local = [
+        away[:, 0] * motion[0, k] + away[:, 1] * motion[1, k] + away[:, 2] * motion[2, k] for k in range(3)
+    ]
+    uv = np.stack([K[0, 0] * local[0] / local[2] + K[0, 2], K[1, 1] * local[1] / local[2] + K[1, 2]], -1)
+    seen = rasterise(uv * s, local[2], shape.faces, width * s, height * s)
+    weights = seen.weights.astype(np.float32)
+
+    def blend(values):
+        corners = values.astype(np.float32)[shape.faces[seen.face]]
+        return (
+            corners[:, 0] * weights[:, :1] + corners[:, 1] * weights[:, 1:2] + corners[:, 2] * weights[:, 2:]
+        )
+
+    colours = paint_object(blend(shape.vertices), blend(shape.normals), shape.parts[seen.face])
+    samples = np.zeros((height * s * width * s, 4), np.float32)
+    samples[seen.sample, :3], samples[seen.sample, 3] = colours, 1
+    samples = samples.reshape(height, s, width, s, 4)
+    mask = samples[:, s // 2, :, s // 2, 3] > 0
+    mean = sum(samples[:, i, :, j] for i in range(s) for j in range(s)) / np.float32(s * s)
+    if config.background == "room":
+        behind = paint_room(*_rays_in_shape(camera)).reshape(height, width, 3)
+    else:
+        behind = np.full((height, width, 3), float(config.background == "white"), np.float32)
+    image = mean[..., :3] + (1 - mean[..., 3:]) * behind
+    image = np.clip(image * 255 + np.float32(0.5), 0, 255).astype(np.uint8)
+    return torch.from_numpy(image), torch.from_numpy(mask.copy())
+
+
+def _rays_in_shape(camera):
+    """Origin (3,) and directions (H W, 3) float32 of the pixel centres in the shape's frame."""
+    import numpy as np
+
+    K, motion = camera.intrinsics.numpy(), camera.world_from_camera.numpy()
+    v, u = np.mgrid[: int(camera.height), : int(camera.width)] + 0.5
+    x, y = (u.ravel() - K[0, 2]) / K[0, 0], (v.ravel() - K[1, 2]) / K[1, 1]
+    d = [motion[k, 0] * x + motion[k, 1] * y + motion[k, 2] for k in range(3)]
+    c, s = math.cos(_YAW), math.sin(_YAW)
+    d = np.stack([c * d[0] + s * d[1], c * d[1] - s * d[0], d[2]], -1)
+    d /= np.sqrt(d[:, :1] ** 2 + d[:, 1:2] ** 2 + d[:, 2:] ** 2)
+    o = (motion[:3, 3] - np.array(_CENTRE)) / _SCALE
+    return np.array([c * o[0] + s * o[1], c * o[1] - s * o[0], o[2]]) + np.array(_MIDDLE), d.astype(
+        np.float32
+    )

@@ -1,0 +1,148 @@
+"""visdom-check, as a user types it."""
+
+import json
+import logging
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from datamodules import load
+from tests.datamodules.layouts.prepared_writer import write_prepared
+from tests.hull.checks.faults import FAULTS, capture_of
+from visdom_plugin.cli.commands.check import check_views, main, warn_of_faults
+from visdom_plugin.figures.check_sheet import draw_check
+from visdom_plugin.scene import Scene, Views
+
+
+@pytest.fixture(scope="module")
+def sound():
+    return load(None, views=4, downscale=2)
+
+
+@pytest.fixture(scope="module")
+def folder(sound, tmp_path_factory):
+    return write_prepared(sound, tmp_path_factory.mktemp("check") / "scene")
+
+
+def spoil(folder, tmp_path, change):
+    """A copy of the scene with the second training view's mask file changed."""
+    import shutil
+
+    copy = tmp_path / "scene"
+    shutil.copytree(folder, copy)
+    path = copy / "masks" / "train_001.png"
+    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert cv2.imwrite(str(path), change(mask))
+    return copy
+
+
+def test_a_sound_scene_exits_with_0(folder, capsys):
+    assert main([str(folder), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["clean"] and report["findings"] == [] and report["k"] == 3
+    assert [n["kind"] for n in report["notes"]] == ["border"]
+    assert sorted(report["covisibility"]) == ["1", "2", "3"]
+    assert list(report["covisibility"]["3"]) == report["views"]
+
+
+def test_the_built_in_scene_is_sound(capsys):
+    assert main([]) == 0
+    shown = capsys.readouterr().out
+    assert "4 views, nothing wrong" in shown and "K = 3" in shown
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("inverted", lambda m: 255 - m),
+        ("empty", lambda m: 0 * m),
+        ("full", lambda m: 0 * m + 255),
+        ("size", lambda m: m[:-10]),
+        ("view", lambda m: m[:, ::-1]),
+    ],
+)
+def test_findings_exit_with_1_and_name_the_view(folder, tmp_path, kind, change, capsys):
+    spoilt = spoil(folder, tmp_path, change)
+    assert main([str(spoilt), "--json"]) == 1
+    (finding,) = json.loads(capsys.readouterr().out)["findings"]
+    assert finding["kind"] == kind and any("train_001" in name for name in finding["views"])
+    assert finding["todo"] and finding["sure"] in ("certain", "likely", "possible")
+    assert main([str(spoilt), "--quiet"]) == 1
+    assert capsys.readouterr().out == ""
+    assert main([str(spoilt)]) == 1
+    assert "1 finding" in capsys.readouterr().out
+
+
+def test_sheet_and_report_are_written(folder, tmp_path, capsys):
+    spoilt = spoil(folder, tmp_path, lambda m: np.roll(m, 12, 1))
+    out = tmp_path / "report"
+    assert main([str(spoilt), "--out", str(out), "--json"]) == 1
+    assert sorted(p.name for p in out.iterdir()) == ["check.json", "check.png"]
+    assert json.loads((out / "check.json").read_text()) == json.loads(capsys.readouterr().out)
+    assert cv2.imread(str(out / "check.png")).std() > 10
+
+
+def test_the_sheet_is_red_where_a_mask_disagrees(sound):
+    def redness(capture):
+        grey = tuple(torch.full_like(i, 128) for i in capture.images)
+        views = Views(capture.cameras, grey, capture.masks, capture.names)
+        sheet = draw_check(views, capture.masks, check_views(views, capture.masks)).astype(int)
+        # Below the lines of text.
+        pixels = sheet[60:]
+        return int((pixels[..., 0] - pixels[..., 1:].max(-1) > 120).sum())
+
+    capture = capture_of(sound.train)
+    assert redness(capture) < 30
+    assert redness(FAULTS["mirrored_mask"](capture, 1).capture) > 500
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nowhere"], "no such folder"),
+        (["one", "--data", "two"], "two scenes"),
+        (["-k", "0"], "k is 0"),
+        (["--views", "99"], "train_views"),
+    ],
+)
+def test_mistakes_exit_with_2_and_a_message(words, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main([*words, "--json"]) == 2
+    shown = capsys.readouterr()
+    assert said in shown.err
+    assert shown.out == "" and "Traceback" not in shown.err
+
+
+def test_a_k_that_asks_too_much_exits_with_1(folder, capsys):
+    assert main([str(folder), "-k", "5", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["findings"][0]["kind"] == "covisibility"
+
+
+def test_training_is_warned(sound, caplog):
+    def scene_of(capture):
+        views = Views(capture.cameras, capture.images, capture.masks, capture.names)
+        return Scene("spoilt", views, views)
+
+    capture = capture_of(sound.train)
+    with caplog.at_level(logging.WARNING):
+        warn_of_faults(scene_of(capture))
+        assert caplog.text == ""
+        warn_of_faults(scene_of(FAULTS["inverted"](capture, 2).capture))
+    assert "train_002" in caplog.text and "certain" in caplog.text and "what to do" in caplog.text
+
+
+def test_help_needs_no_heavy_import():
+    code = (
+        "import sys\n"
+        "from visdom_plugin.cli.commands.check import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "heavy = {'torch', 'numba', 'cv2', 'skimage', 'scipy'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "--data.missing-masks" in done.stdout

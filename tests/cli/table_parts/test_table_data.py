@@ -1,0 +1,139 @@
+"""What tables know of data before a run: each file that a job reads is in its name, and readings tell no lies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from tests.datamodules.layouts.layout_writers import join, write_colmap
+from tests.datamodules.layouts.prepared_writer import write_prepared
+from visdom_plugin.cli.commands.table import Options, make_workshop
+from visdom_plugin.cli.options import READING
+from visdom_plugin.cli.table_parts.table_data import OWN, DataHasher, tidy_reading
+from visdom_plugin.errors import ConfigError, SceneError
+from visdom_plugin.tables.run.jobs import plan
+from visdom_plugin.tables.spec import parse_table
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return make_scene(SyntheticConfig(size=(32, 24), test_views=2))
+
+
+@pytest.fixture
+def root(drawn, tmp_path, monkeypatch):
+    """A folder of one scene; the working directory is beside it."""
+    monkeypatch.chdir(tmp_path)
+    write_prepared(drawn, tmp_path / "mine/thing")
+    return tmp_path / "mine"
+
+
+def _plan(root: Path, kind: str = "train", settings=None, **column):
+    row = {"label": "A", "method": "hull" if kind == "hull" else "ingp+vd", "settings": settings or {}}
+    column = {"label": "c", "root": "mine", "scenes": ["thing"], **column}
+    spec = parse_table({"kind": kind, "rows": [row], "columns": [column], "budget": "quick"}, "t", "t.yaml")
+    return plan(spec, Path("runs"), make_workshop(Options(device="cpu")), {"mine": root})
+
+
+def _run(*given, **column) -> str:
+    (job,) = _plan(*given, **column).jobs
+    return job.run_dir.name
+
+
+def _touch(path: Path) -> None:
+    path.write_bytes(path.read_bytes() + b"\n")
+
+
+def test_a_run_is_named_after_what_its_scenes_reader_opens(root):
+    before = _run(root)
+    for name in ("hull.ply", "mesh.ply", "table.md", "images/nobody.png", "runs/a/run.json", "runs/a/x.png"):
+        (root / "thing" / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / "thing" / name).write_text("written later")
+    assert _run(root) == before
+    names = {before}
+    read = ["images/train_000.png", "masks/test_001.png", "sparse_4.txt", "sparse/0/images.txt"]
+    for count, name in enumerate(read, start=2):
+        _touch(root / "thing" / name)
+        names.add(_run(root))
+        assert len(names) == count, name
+
+
+def test_a_list_counts_by_what_it_holds_and_is_found_from_anywhere(root, tmp_path, monkeypatch):
+    listed = tmp_path / "list.txt"
+    listed.write_text("2 3 4 5")
+    made = _plan(root, reading={"train_list": "list.txt"})
+    ((run_dir, task),) = made.tasks.items()
+    assert task.content["train_list"] == str(listed)
+    monkeypatch.chdir(root)
+    assert _run(root, reading={"train_list": str(listed)}) == run_dir.name
+    listed.write_text("2 3 5 4")
+    assert _run(root, reading={"train_list": str(listed)}) != run_dir.name
+
+
+@pytest.mark.parametrize("train_list", ["2,3,4", "list.txt"])
+def test_a_list_of_another_length_than_views_is_refused(root, tmp_path, train_list):
+    (tmp_path / "list.txt").write_text("2 3 4")
+    with pytest.raises(
+        ConfigError, match=r"lists 3 training views, views says 4(.|\n)*column 'c'(.|\n)*views: 3"
+    ):
+        _plan(root, reading={"train_list": train_list})
+    assert len(_plan(root, views=3, reading={"train_list": train_list}).jobs) == 1
+    with pytest.raises(ConfigError, match="no view of this scene"):
+        _plan(root, reading={"train_list": "2,3,4,nobody"})
+
+
+def test_files_behind_links_count(drawn, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_colmap(join(drawn.train, drawn.test), tmp_path / "mine/thing")
+    (tmp_path / "mine/thing/images").rename(tmp_path / "raw")
+    (tmp_path / "mine/thing/images").symlink_to("../../raw", target_is_directory=True)
+    before = _run(tmp_path / "mine", reading={"allow_outside": True})
+    for path in (tmp_path / "raw").iterdir():
+        _touch(path)
+    assert _run(tmp_path / "mine", reading={"allow_outside": True}) != before
+
+
+def test_the_true_surface_counts_where_it_is_measured_against(root, tmp_path):
+    for place, settings in ((tmp_path, {"target": "mesh.ply"}), (root / "thing", {})):
+        names = {_run(root, "hull", settings)}
+        train = _run(root)
+        for text in ("one", "two"):
+            (place / "mesh.ply").write_text(text)
+            names.add(_run(root, "hull", settings))
+        assert len(names) == 3 and _run(root) == train
+
+
+def test_a_scene_that_cannot_be_read_is_another_run_once_it_is_mended(root):
+    (root / "thing/sparse").rename(root / "thing/parse")
+    hasher = DataHasher()
+    for _ in range(2):
+        with pytest.raises(SceneError):
+            hasher("train", root / "thing", {"views": 4, "downscale": 1.0}, None)
+    broken = _run(root)
+    (root / "thing/parse").rename(root / "thing/sparse")
+    assert _run(root) != broken
+
+
+@pytest.mark.parametrize(
+    "name", [*OWN, "data", "show_config", "out", "overwrite", "quiet", "config", "mask_sorce"]
+)
+def test_a_reading_holds_only_how_a_scene_is_read(name, root):
+    with pytest.raises(ConfigError, match=f"reading cannot hold '{name}'(.|\n)*column 'c' of t.yaml"):
+        _plan(root, reading={name: True})
+
+
+def test_what_a_reading_may_hold_reaches_the_run():
+    given = {
+        "missing_masks": "hull",
+        "mask_source": "alpha",
+        "train_list": "0,1",
+        "test_list": "2",
+        "frame": 3,
+        "mask_path": "foreground",
+        "allow_outside": True,
+    }
+    assert tidy_reading(given, "here") == given and set(given) | set(OWN) == set(READING)
+    with pytest.raises(ConfigError, match=r"reading\.frame cannot be 'first'"):
+        tidy_reading({"frame": "first"}, "here")

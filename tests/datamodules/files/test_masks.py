@@ -1,0 +1,128 @@
+"""One foreground, in every form a mask file can have, reads the same."""
+
+import io
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datamodules.files import masks
+from visdom_plugin.errors import SceneError
+
+PIL = pytest.importorskip("PIL.Image")
+TRUTH = np.zeros((12, 17), bool)
+TRUTH[3:9, 4:15] = True
+TRUTH[5, 6] = False
+
+
+def _pil(mode, image):
+    out = io.BytesIO()
+    made = PIL.fromarray(image)
+    assert made.mode == mode
+    made.save(out, "PNG")
+    return out.getvalue()
+
+
+def _cv(image):
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def _one_bit():
+    out = io.BytesIO()
+    PIL.fromarray(TRUTH.astype(np.uint8) * 255).convert("1").save(out, "PNG")
+    return out.getvalue()
+
+
+def _palette():
+    out = io.BytesIO()
+    image = PIL.fromarray(TRUTH.astype(np.uint8)).convert("P")
+    image.putpalette([0, 0, 0, 255, 255, 255] + [9] * 750)
+    image.save(out, "PNG")
+    return out.getvalue()
+
+
+GREY = TRUTH.astype(np.uint8) * 255
+COLOUR = np.repeat(GREY[..., None], 3, -1)
+NOISE = np.random.default_rng(0).integers(0, 256, (12, 17, 3)).astype(np.uint8)
+FULL = np.full_like(GREY, 255)
+FORMS = {
+    "L": lambda: _pil("L", GREY),
+    "LA, mask in L": lambda: _pil("LA", np.stack([GREY, FULL], -1)),
+    "LA, mask in A": lambda: _pil("LA", np.stack([FULL, GREY], -1)),
+    "LA, mask in both": lambda: _pil("LA", np.stack([GREY, GREY], -1)),
+    "RGB": lambda: _pil("RGB", COLOUR),
+    "RGB, one colour": lambda: _pil("RGB", np.stack([GREY, 0 * GREY, 0 * GREY], -1)),
+    "RGBA, mask in RGB": lambda: _pil("RGBA", np.dstack([COLOUR, FULL])),
+    "RGBA, cut-out": lambda: _pil("RGBA", np.dstack([NOISE, GREY])),
+    "1 bit": _one_bit,
+    "palette": _palette,
+    "16 bit": lambda: _cv(TRUTH.astype(np.uint16) * 65535),
+    "16 bit RGBA": lambda: _cv(
+        np.dstack([np.full((12, 17, 3), 40000, np.uint16), TRUTH.astype(np.uint16) * 65535])
+    ),
+    "JPEG": lambda: cv2.imencode(".jpg", cv2.resize(GREY, None, fx=1, fy=1), [cv2.IMWRITE_JPEG_QUALITY, 100])[
+        1
+    ].tobytes(),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_reads_the_same(form, tmp_path):
+    mask = masks.decode(FORMS[form](), tmp_path / "mask.png")
+    assert np.array_equal(mask.opacity > 0.5, TRUTH)
+    assert mask.opacity.dtype == np.float32 and mask.opacity.max() > 0.97
+    assert form == "JPEG" or mask.soft == 0
+
+
+def test_two_masks_in_one_file_are_not_chosen_between(tmp_path):
+    data = _pil("LA", np.stack([GREY, GREY[:, ::-1]], -1))
+    with pytest.raises(SceneError, match="two different masks"):
+        masks.decode(data, tmp_path / "mask.png")
+
+
+@given(st.floats(0, 1))
+@settings(max_examples=20, deadline=None)
+def test_soft_pixels_are_counted(share):
+    rng = np.random.default_rng(1)
+    image = np.where(rng.random((30, 30)) < share, 128, 255).astype(np.uint8)
+    assert masks.decode(_cv(image), "mask.png").soft == pytest.approx((image == 128).mean())
+
+
+def test_sizes_fit_when_they_are_one_picture(tmp_path):
+    for full in ((3118, 2078), (801, 599), (48, 36)):
+        for factor in (1, 2, 3.7, 4, 8):
+            smaller = tuple(round(s / factor) for s in full)
+            assert masks.fits(smaller, full) and masks.fits(full, smaller)
+    assert not masks.fits((48, 35), (48, 36)) and not masks.fits((36, 48), (48, 36))
+    assert not masks.fits((9600, 7200), (48, 36)), "a bomb"
+
+
+def test_a_file_and_an_alpha_channel_that_disagree_are_both_named(tmp_path):
+    one = masks.decode(FORMS["L"](), tmp_path / "cup.png")
+    masks.refuse_two(one, one, tmp_path / "masks/cup.png", tmp_path / "images/cup.png")
+    twice = masks.Mask(np.kron(one.opacity, np.ones((2, 2), np.float32)), 0.0)
+    masks.refuse_two(one, twice, tmp_path / "masks/cup.png", tmp_path / "images/cup.png")
+    other = masks.Mask(one.opacity[:, ::-1], 0.0)
+    with pytest.raises(
+        SceneError, match=r"masks/cup\.png[\s\S]*images/cup\.png[\s\S]*--data\.mask-source folder"
+    ):
+        masks.refuse_two(one, other, tmp_path / "masks/cup.png", tmp_path / "images/cup.png")
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (0, "found nothing"),
+        (1 / 255, "0 and 1"),
+        (10 / 255, "10 of 255"),
+        (127 / 255, "127 of 255, and only what is above one half"),
+        (0.5, "above one half"),
+        (0.9, "thinner than a pixel"),
+    ],
+)
+def test_an_empty_mask_says_why(value, said):
+    with pytest.raises(SceneError, match=said):
+        masks.refuse_empty(np.zeros((3, 3), bool), value, "mask.png")
+    masks.refuse_empty(np.ones((3, 3), bool), value, "mask.png")

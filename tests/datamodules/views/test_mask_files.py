@@ -1,0 +1,112 @@
+"""Which mask belongs to which photograph: ordinary folders are read, shifted ones are not."""
+
+import json
+import logging
+from dataclasses import replace
+
+import pytest
+import torch
+
+from datamodules import load
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from tests.datamodules.layouts import layout_writers as w
+from visdom_plugin.errors import SceneError
+
+
+@pytest.fixture(scope="module")
+def views():
+    return make_scene(SyntheticConfig(size=(32, 24), train_views=8, test_views=0)).train
+
+
+def _masks(folder):
+    return load(folder, views=7).train.masks
+
+
+def _rename(folder, change):
+    for path in sorted((folder / "masks").iterdir()):
+        path.rename(path.with_name("moved_" + path.name))
+    for path in sorted((folder / "masks").iterdir()):
+        path.rename(path.with_name(change(path.name.removeprefix("moved_"))))
+
+
+@pytest.mark.parametrize("ending", [".PNG", "_mask.PNG", ".png.PNG"])
+def test_endings_may_be_in_capitals(ending, views, tmp_path):
+    folder = w.write_colmap(views, tmp_path / "s")
+    expected = _masks(folder)
+    _rename(folder, lambda name: name.removesuffix(".png") + ending)
+    assert all(map(torch.equal, _masks(folder), expected))
+
+
+def test_photographs_without_ending_may_end_in_capitals(views, tmp_path):
+    folder = w.write_instant_ngp(views, tmp_path / "s")
+    expected = load(folder, views=7).train
+    for path in (folder / "images").iterdir():
+        path.rename(path.with_suffix(".PNG"))
+    found = load(folder, views=7).train
+    assert all(map(torch.equal, found.images, expected.images)) and found.names[0].endswith(".PNG")
+
+
+def _in_folders(views, folder):
+    """The scene with its photographs in photos/, and what its own writer put into masks/."""
+    w.write_nerfstudio(views, folder)
+    path = folder / "transforms.json"
+    path.write_text(path.read_text().replace("images/", "photos/"))
+    (folder / "images").rename(folder / "photos")
+    return folder
+
+
+def test_masks_may_leave_the_photographs_folder_out(views, tmp_path):
+    folder = _in_folders(views, tmp_path / "s")
+    expected = [views.masks[i] for i in range(1, 8)]
+    assert all(map(torch.equal, _masks(folder), expected))
+    first = (folder / "masks" / f"{views.names[1]}.png").read_bytes()
+    (folder / "masks/photos").mkdir()
+    (folder / "masks/photos" / f"{views.names[2]}.png").write_bytes(first)
+    assert torch.equal(_masks(folder)[1], expected[0]), "the whole path goes first"
+    (folder / "masks" / f"{views.names[3]}.png").unlink()
+    with pytest.raises(SceneError) as caught:
+        _masks(folder)
+    for place in ("masks/photos/", "masks/"):
+        assert f"{place}{views.names[3]}.png" in caught.value.todo
+
+
+def test_a_bare_name_of_two_photographs_is_no_name(views, tmp_path):
+    folder = _in_folders(views, tmp_path / "s")
+    content = json.loads((folder / "transforms.json").read_text())
+    (folder / "more").mkdir()
+    other, same = f"more/{views.names[4]}.png", f"photos/{views.names[4]}.png"
+    (folder / other).write_bytes((folder / same).read_bytes())
+    entry = next(f for f in content["frames"] if f["file_path"] == same)
+    content["frames"].append(entry | {"file_path": other})
+    (folder / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=f"no mask: .*{views.names[4]}"):
+        load(folder, train_list=f"{other},{same}")
+
+
+@pytest.mark.parametrize("shift", [-3, -1, 1, 4])
+@pytest.mark.parametrize("lost", [False, True])
+def test_shifted_masks_are_refused_and_warned_of(shift, lost, views, tmp_path, caplog):
+    named = replace(views, names=tuple(f"img_{10 + i:03d}" for i in range(8)))
+    folder = w.write_colmap(named, tmp_path / "s")
+    _rename(folder, lambda name: f"img_{int(name[4:7]) + shift:03d}.png")
+    if lost:
+        (folder / f"masks/img_{14 + shift:03d}.png").unlink()
+    with pytest.raises(SceneError) as caught:
+        load(folder, train_list="3,4")
+    assert f"shifted by {shift}" in caught.value.cause
+    with caplog.at_level(logging.WARNING, "datamodules"):
+        load(folder, train_list="3,4", allow_missing_masks=True)
+    assert f"shifted by {shift}" in caplog.text
+
+
+def test_missing_masks_beside_stray_ones_are_not_called_shifted(views, tmp_path, caplog):
+    folder = w.write_colmap(views, tmp_path / "s")
+    for i in (0, 3):
+        (folder / f"masks/{views.names[i]}.png").rename(folder / f"masks/{views.names[i]}_old.png")
+    with caplog.at_level(logging.WARNING, "datamodules"):
+        train = load(folder, train_list="1,2,3", allow_missing_masks=True).train
+        assert [train.mask_origin(i) for i in range(3)] == ["given", "given", "missing"]
+        assert len(load(folder, train_list="1,2", test=False).train) == 2
+        (folder / "masks/train_999.png").write_bytes((folder / "masks/train_001.png").read_bytes())
+        assert len(load(folder, train_list="1,2", test=False).train) == 2
+    assert "shifted" not in caplog.text

@@ -1,0 +1,242 @@
+"""visdom-check: what is wrong with a scene, before a minute is spent on training."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from visdom_plugin.cli.entry import run
+from visdom_plugin.cli.options import Reading, read_options
+from visdom_plugin.errors import ConfigError, SceneError
+
+if TYPE_CHECKING:
+    from visdom_plugin.hull.checks.check import Check
+    from visdom_plugin.hull.checks.findings import Finding
+    from visdom_plugin.scene import Scene, Views
+
+FOUND = 1
+"""Exit status with findings."""
+
+
+@dataclass(frozen=True)
+class Options(Reading):
+    """Check cameras, masks and photographs of a scene.
+
+    Finds masks that are inverted, empty, full, cut off, speckled, doubled or of the wrong size; poses with wrong
+    axes; photographs in the wrong order; wrong focal lengths; the view that does not fit the others; views from
+    too similar directions; and tells the K that the views allow. Exits with 0 when nothing is wrong, 1 with
+    findings, 2 when the scene cannot be read.
+    """
+
+    folder: tyro.conf.Positional[Path | None] = None
+    """Folder of the scene; without it, the built-in scene."""
+    data: Path | None = None
+    """The same as the positional argument."""
+    views: int = 4
+    """Training views."""
+    downscale: float = 1.0
+    """Work on images smaller by this factor."""
+    seed: int = 0
+    """Of the built-in scene."""
+    k: Annotated[int | Literal["auto"], tyro.conf.arg(aliases=["-k"])] = "auto"
+    """The K you are going to use; auto has one advised."""
+    missing_masks: Annotated[Literal["error", "colour", "hull"], tyro.conf.arg(name="data.missing-masks")] = (
+        "error"
+    )
+    """Training views without a mask: an error, or left out of the check (colour and hull alike)."""
+    mask_source: Annotated[Literal["auto", "folder", "alpha"], tyro.conf.arg(name="data.mask-source")] = (
+        "auto"
+    )
+    """Where masks are read: their folder, the photographs' alpha channel, or whichever there is."""
+    out: Path | None = None
+    """Folder for the contact sheet (check.png) and the report (check.json)."""
+    json: bool = False
+    """Print one JSON object instead of the table."""
+    quiet: bool = False
+    """Print nothing but errors; the exit status tells."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return run(_main, argv)
+
+
+def _main(argv: Sequence[str]) -> int:
+    options = tyro.cli(Options, args=list(argv), prog="visdom-check")
+    if options.folder is not None and options.data is not None and options.folder != options.data:
+        raise ConfigError(f"two scenes: {options.folder} and {options.data}", todo="name one")
+    if options.k != "auto" and options.k < 1:
+        raise ConfigError(f"k is {options.k}", where="-k", todo="use a whole number from 1, or auto")
+    if options.out is not None and options.out.exists() and not options.out.is_dir():
+        raise ConfigError("this is a file, not a folder", where=f"--out {options.out}", todo="name a folder")
+    folder = options.folder or options.data
+    started = time.perf_counter()
+    from visdom_plugin.cli.scenes import open_scene
+
+    try:
+        scene = open_scene(folder, **read_options(options), fill=False, test=False)
+        views, masks = carving_views(scene.train)
+    except SceneError as error:
+        if not _is_about_a_mask(error, folder):
+            raise
+        report = {"scene": folder.name, "views": [], "findings": [_unreadable(error)], "notes": []}
+        _show(report, options)
+        return FOUND
+    loaded = time.perf_counter()
+    k = None if options.k == "auto" else options.k
+    found = check_views(views, masks, k=k, layout=scene.source.get("layout"))
+    report = _report(scene, views, found)
+    report["seconds"] = {
+        "load": round(loaded - started, 3),
+        "check": round(time.perf_counter() - loaded, 3),
+    }
+    if options.out is not None:
+        from visdom_plugin.atomic_files import write_bytes
+        from visdom_plugin.figures.check_sheet import draw_check
+        from visdom_plugin.figures.contact_sheet import write_png
+
+        options.out.mkdir(parents=True, exist_ok=True)
+        write_png(options.out / "check.png", draw_check(views, masks, found))
+        report["out"] = str(options.out)
+        write_bytes(options.out / "check.json", (json.dumps(report, indent=1) + "\n").encode())
+    _show(report, options)
+    return FOUND if found.findings else 0
+
+
+def warn_of_faults(scene: Scene) -> None:
+    """A brief check before training: every finding as one warning on the log; never stops anything."""
+    import logging
+
+    log = logging.getLogger(__name__)
+    views, masks = carving_views(scene.train)
+    for f in check_views(views, masks, brief=True, layout=scene.source.get("layout")).findings:
+        log.warning("%s (%s); what to do: %s; `visdom-check` tells more", f.what, f.sure, f.todo)
+
+
+def carving_views(views: Views) -> tuple[Views, list]:
+    """The views whose masks were given, and these masks with ignored pixels as foreground."""
+    from visdom_plugin.scene import Views
+
+    given = [i for i in range(len(views)) if views.mask_origin(i) == "given"]
+    cameras, masks = views.silhouettes()
+    images = [views.images[i] for i in given]
+    names = [views.names[i] for i in given]
+    masks = list(masks)
+    return Views(cameras, images, masks, names), masks
+
+
+def check_views(
+    views: Views, masks: Sequence, *, k: int | None = None, brief: bool = False, layout: str | None = None
+) -> Check:
+    """`hull.check.check` of a scene's views; `layout` is that of a scene on disk."""
+    from visdom_plugin.hull.checks.check import check
+    from visdom_plugin.hull.checks.pose_files import pose_faults
+
+    images = () if brief else views.images
+    return check(views.cameras, masks, images, views.names, k=k, brief=brief, poses=pose_faults(layout))
+
+
+def _report(scene: Scene, views: Views, found: Check) -> dict[str, Any]:
+    usable = [views.names[i] for i in found.usable]
+    report = {
+        "scene": scene.name,
+        "views": list(views.names),
+        "clean": not found.findings,
+        "findings": [_plain(f, views.names) for f in found.findings],
+        "notes": [_plain(f, views.names) for f in found.notes],
+    }
+    if found.advice is not None:
+        report["k"] = found.advice.k
+        report["k_why"] = found.advice.why
+        report["covisibility"] = {
+            k: {n: round(float(c), 4) for n, c in zip(usable, shares, strict=True)}
+            for k, shares in found.advice.covered.items()
+        }
+    if found.fit is not None:
+        from visdom_plugin.hull.checks.distance_fields import OBJECT_PX
+
+        report["misfit"] = round(found.fit.score / OBJECT_PX, 6)
+        report["constraint"] = round(found.fit.power / OBJECT_PX, 6)
+    return report
+
+
+def _plain(finding: Finding, names: Sequence[str]) -> dict[str, Any]:
+    return {
+        "kind": finding.kind,
+        "what": finding.what,
+        "views": [names[i] for i in finding.views],
+        "sure": finding.sure,
+        "evidence": round(float(finding.evidence), 6),
+        "todo": finding.todo,
+    }
+
+
+def _is_about_a_mask(error: SceneError, folder: Path | None) -> bool:
+    """Whether one mask of a scene that is otherwise there made it unreadable."""
+    where = error.where
+    if folder is None or not isinstance(where, Path) or not where.is_file():
+        return False
+    return "mask" in error.what and where.resolve().is_relative_to(folder.resolve())
+
+
+def _unreadable(error: SceneError) -> dict[str, Any]:
+    kind = "empty" if "empty" in error.what else "size" if " x " in error.what else "mask"
+    what = error.what + (f" ({error.cause})" if error.cause else "")
+    return {
+        "kind": kind,
+        "what": what,
+        "views": [Path(error.where).stem],
+        "sure": "certain",
+        "evidence": 1.0,
+        "todo": error.todo or "",
+    }
+
+
+def _show(report: dict[str, Any], options: Options) -> None:
+    if options.json:
+        sys.stdout.write(json.dumps(report) + "\n")
+    elif not options.quiet:
+        _table(report)
+
+
+def _table(report: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    colours = {"certain": "red", "likely": "yellow", "possible": "cyan", "note": "dim"}
+    rows = [*((f["sure"], f) for f in report["findings"]), *(("note", f) for f in report["notes"])]
+    count = len(report["findings"])
+    said = "nothing wrong" if count == 0 else "1 finding" if count == 1 else f"{count} findings"
+    console.print(f"[bold]{escape(report['scene'])}[/bold]: {len(report['views'])} views, {said}")
+    if rows:
+        table = Table(show_edge=False, pad_edge=False, show_lines=True)
+        for title in ("", "sure", "views", "what, and what to do"):
+            table.add_column(title)
+        for sure, f in rows:
+            views = f["views"]
+            shown = ", ".join(views[:3]) + (f" and {len(views) - 3} more" if len(views) > 3 else "")
+            text = f"{escape(f['what'])}\n[italic]{escape(f['todo'])}[/italic]"
+            table.add_row(f["kind"], f"[{colours[sure]}]{sure}[/]", escape(shown) or "all", text)
+        console.print(table)
+    if "k_why" in report:
+        console.print(escape(report["k_why"]))
+    if "misfit" in report:
+        console.print(
+            f"masks and cameras miss each other by {report['misfit']:.2%} of the object's length in the mean; the "
+            f"others stop what passes beside a mask within {report['constraint']:.1%} of it"
+        )
+    if "out" in report:
+        console.print(f"look at {escape(report['out'])}/check.png")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

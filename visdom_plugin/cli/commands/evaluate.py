@@ -1,0 +1,60 @@
+"""visdom-eval: measures a run again from its last checkpoint, or a method by leaving each view out in turn."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from visdom_plugin.cli import entry
+
+
+@dataclass(frozen=True)
+class Options:
+    """Renders the test views of a run from its last checkpoint and measures them again.
+
+    With --leave-one-out in place of a run it takes a method and the options of visdom-train, and measures on each
+    training view what was made without it: visdom-eval --leave-one-out method:3dgs-go+vd --data DIR --views 4
+    """
+
+    run: tyro.conf.Positional[Path]
+    """Run directory, as visdom-train names it."""
+    data: Path | None = None
+    """Where the scene is now, if it has moved."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return entry.run(_evaluate, argv)
+
+
+def _evaluate(argv: Sequence[str]) -> int:
+    if "--leave-one-out" in argv:
+        from visdom_plugin.cli.evaluation.leave_one_out import leave_one_out
+
+        return leave_one_out([word for word in argv if word != "--leave-one-out"])
+    options = tyro.cli(Options, args=argv, prog="visdom-eval")
+
+    from visdom_plugin.cli.report import say, show_result
+    from visdom_plugin.cli.scenes import open_run
+    from visdom_plugin.training.run import evaluate_again
+
+    record, config, scene, method, hull, device, step = open_run(options.run, options.data, options.device)
+    if record["status"] != "finished" and not options.quiet:
+        say(f"the run is {record['status']}: this is its state after {step} steps")
+    record = evaluate_again(method, config, hull, scene, device=device, run_dir=options.run)
+    if not options.quiet:
+        show_result(record, options.run)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,244 @@
+"""visdom-hull: carve the visible domain of a scene, measure it and write it down."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from visdom_plugin.cli.entry import run
+from visdom_plugin.cli.options import Reading, read_options
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.hull.domain import Box, VisibleDomain
+
+_DEFAULT = VisibleDomain()
+
+
+@dataclass(frozen=True)
+class Options(Reading):
+    """Carve the visible-domain hull of a scene from its cameras and masks.
+
+    Prints what it measured; --out writes the mesh (.ply) or the voxel grid (.npz).
+    """
+
+    folder: tyro.conf.Positional[Path | None] = None
+    """Folder of the scene; without it, the built-in scene."""
+    data: Path | None = None
+    """The same as the positional argument."""
+    views: int = 4
+    """Training views; the hull sees no others."""
+    downscale: float = 1.0
+    """Work on images smaller by this factor."""
+    seed: int = 0
+    """Of the built-in scene."""
+    k: Annotated[int | Literal["n-1", "auto"], tyro.conf.arg(aliases=["-k"])] = _DEFAULT.k
+    """Fewest views that must see a voxel."""
+    agreement: float = _DEFAULT.agreement
+    """Share of the views that see a voxel that must have it inside their mask."""
+    max_misses: int | None = None
+    """Views that may miss, in place of the agreement."""
+    kind: Literal["visdom", "traditional", "unit-sphere", "released-go"] = "visdom"
+    """Which hull: the visible domain, without K, that inside a ball, or GaussianObject's rule."""
+    resolution: int = _DEFAULT.resolution
+    """Voxels along the grid's longest side."""
+    bounds: Box | None = None
+    """Lower and upper corner, six numbers in world units; by default found from cameras and masks."""
+    components: Literal["explain", "drop-small", "all", "largest"] = "explain"
+    """Which connected pieces stay: those that explain foreground of their own, large ones, all, the largest."""
+    min_component_fraction: float = _DEFAULT.min_component_fraction
+    """Pieces below this fraction of the largest are small."""
+    dilate_px: int = 0
+    """Grow the masks by this many pixels first."""
+    sphere_centre: tuple[float, float, float] | None = None
+    """Centre of the ball of --kind unit-sphere, world units."""
+    sphere_radius: float | None = None
+    """Radius of that ball."""
+    missing_masks: Annotated[Literal["error", "colour", "hull"], tyro.conf.arg(name="data.missing-masks")] = (
+        "error"
+    )
+    """Training views without a mask: an error, or left out of the carving (colour and hull alike)."""
+    mask_source: Annotated[Literal["auto", "folder", "alpha"], tyro.conf.arg(name="data.mask-source")] = (
+        "auto"
+    )
+    """Where masks are read: their folder, the photographs' alpha channel, or whichever there is."""
+    out: Path | None = None
+    """File to write: .ply for the mesh, .npz for the grid."""
+    masks_out: Path | None = None
+    """Folder to write masks to: the hull's outline seen by each of --cameras, 8-bit PNG, white on the hull."""
+    cameras: Literal["train", "test", "orbit"] = "test"
+    """Cameras of --masks-out: the scene's, or a circle round the hull (with a transforms.json)."""
+    frames: int = 60
+    """Cameras on the circle."""
+    overwrite: bool = False
+    """Let --masks-out replace files."""
+    json: bool = False
+    """Print one JSON object instead of the table."""
+    diagnose: bool = False
+    """Look for what is wrong: the view that disagrees, masks that touch the border, what each K leaves."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return run(_main, argv)
+
+
+def _main(argv: Sequence[str]) -> None:
+    options = tyro.cli(Options, args=list(argv), prog="visdom-hull")
+    if options.folder is not None and options.data is not None and options.folder != options.data:
+        raise ConfigError(f"two scenes: {options.folder} and {options.data}", todo="name one")
+    if options.out is not None and options.out.suffix not in (".ply", ".npz"):
+        raise ConfigError(
+            f"cannot write {options.out.name}",
+            where="--out",
+            todo="name a .ply (mesh) or .npz (voxel grid) file",
+        )
+    names = [f.name for f in fields(VisibleDomain)]
+    domain = VisibleDomain(**{name: getattr(options, name) for name in names})
+    if options.frames < 1:
+        raise ConfigError(f"--frames is {options.frames}; it must be at least 1")
+    from visdom_plugin.cli.scenes import open_scene
+
+    masks = None
+    if options.masks_out is not None:
+        masks = MaskRequest(options.masks_out, options.cameras, options.frames, options.overwrite)
+    scene = open_scene(
+        options.folder or options.data,
+        **read_options(options),
+        fill=False,
+        test=masks is not None and masks.cameras == "test",
+    )
+    report = report_hull(domain, scene, out=options.out, diagnosing=options.diagnose, masks=masks)
+    if options.json:
+        sys.stdout.write(json.dumps(report) + "\n")
+    elif not options.quiet:
+        sys.stdout.write(_table(report))
+
+
+@dataclass(frozen=True)
+class MaskRequest:
+    """Masks to make of a hull."""
+
+    folder: Path
+    cameras: str
+    frames: int
+    overwrite: bool
+
+
+def report_hull(
+    domain: VisibleDomain,
+    scene,
+    *,
+    out: Path | None = None,
+    diagnosing: bool = False,
+    masks: MaskRequest | None = None,
+) -> dict[str, Any]:
+    """Carves, measures and writes one hull and its masks.
+
+    Returns:
+        Plain numbers and lists, ready for JSON.
+    """
+    from visdom_plugin.hull.checks.coverage import border_share, diagnose, measure_coverage
+    from visdom_plugin.hull.grid.mesh import is_closed
+    from visdom_plugin.scene import describe_masks
+
+    views = scene.train
+    cameras, silhouettes = views.silhouettes()
+    names = [n for i, n in enumerate(views.names) if views.mask_origin(i) == "given"]
+    hull = domain.carve(cameras, silhouettes)
+    coverage = measure_coverage(hull, cameras, silhouettes)
+    summary = hull.summary
+    report = {
+        "scene": scene.name,
+        "views": names,
+        "masks": [*describe_masks(views), *scene.notes],
+        "kind": domain.kind,
+        "k": summary["k"],
+        "voxels": hull.voxels,
+        "volume": hull.volume,
+        "surface_area": hull.surface_area,
+        "bounds": hull.bounds.tolist(),
+        "extent": hull.extent.tolist(),
+        "resolution": max(hull.shape),
+        "shape": list(hull.shape),
+        "voxel_size": hull.voxel_size,
+        "seconds": summary["seconds"],
+        "bounds_seconds": summary["bounds_seconds"],
+        "bounds_closed": summary["bounds_closed"],
+        "coverage": {n: round(c.covered, 6) for n, c in zip(names, coverage, strict=True)},
+        "inside_mask": {n: round(c.inside, 6) for n, c in zip(names, coverage, strict=True)},
+        "touches_border": [n for n, m in zip(names, silhouettes, strict=True) if border_share(m.numpy()) > 0],
+        "components": summary["components"],
+        "components_found": summary["components_found"],
+        "components_dropped": summary["components_dropped"],
+        "watertight": is_closed(hull.to_mesh()[1]),
+        "agreement_means": summary["agreement_means"],
+    }
+    if diagnosing:
+        found = diagnose(domain, hull, cameras, silhouettes, names)
+        report["diagnosis"] = {
+            "findings": found.findings,
+            "removes": {n: round(v.removes, 4) for n, v in zip(names, found.views, strict=True)},
+            "voxels_per_k": found.voxels_per_k,
+        }
+    if out is not None:
+        hull.write_ply(out) if out.suffix == ".ply" else hull.save(out)
+        report["out"] = str(out)
+    if masks is not None:
+        from visdom_plugin.cli.hulls.hull_masks import choose_cameras, write_masks
+
+        seen_by, files = choose_cameras(masks.cameras, scene, hull, masks.frames)
+        orbit = masks.cameras == "orbit"
+        write_masks(hull, seen_by, files, masks.folder, poses=orbit, overwrite=masks.overwrite)
+        report["masks_out"] = {"folder": str(masks.folder), "cameras": masks.cameras, "count": len(files)}
+    return report
+
+
+def _table(report: dict[str, Any]) -> str:
+    size = " x ".join(f"{b - a:.4g}" for a, b in zip(*report["extent"], strict=True))
+    rows = [
+        ("scene", f"{report['scene']}, {len(report['views'])} views"),
+        ("rule", f"{report['kind']}, K = {report['k']}; {report['agreement_means']}"),
+        *(("data", text) for text in report["masks"]),
+        (
+            "voxels",
+            f"{report['voxels']} of {' x '.join(map(str, report['shape']))}, edge {report['voxel_size']:.4g}",
+        ),
+        ("size", f"{size}, volume {report['volume']:.5g}, surface {report['surface_area']:.5g}"),
+        (
+            "pieces",
+            f"{report['components']} of {report['components_found']} kept"
+            + (f"; {report['components_dropped']}" if report["components_dropped"] else ""),
+        ),
+        ("mesh", "watertight" if report["watertight"] else "not watertight"),
+        ("seconds", f"{report['seconds']:.2f}, and {report['bounds_seconds']:.2f} to find the bounds"),
+    ]
+    rows += [
+        (name, f"{share:.1%} of the mask covered, {report['inside_mask'][name]:.1%} of the hull on it")
+        for name, share in report["coverage"].items()
+    ]
+    if "diagnosis" in report:
+        rows += [
+            (
+                "K",
+                ", ".join(f"{k}: {n}" for k, n in report["diagnosis"]["voxels_per_k"].items())
+                + " voxels of 64^3",
+            )
+        ]
+        rows += [
+            (name, f"its mask alone removes {x:.1%}") for name, x in report["diagnosis"]["removes"].items()
+        ]
+        rows += [("found", text) for text in report["diagnosis"]["findings"] or ["nothing wrong"]]
+    if "out" in report:
+        rows.append(("written", report["out"]))
+    if "masks_out" in report:
+        made = report["masks_out"]
+        rows.append(("masks", f"{made['count']} of the {made['cameras']} cameras in {made['folder']}"))
+    width = max(len(name) for name, _ in rows)
+    return "".join(f"{name:<{width}}  {text}\n" for name, text in rows)

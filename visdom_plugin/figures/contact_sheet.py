@@ -1,0 +1,166 @@
+"""Renders as files: PNGs, the contact sheet, videos."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from visdom_plugin.atomic_files import appearing, write_bytes
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+SHEET_WIDTH_PX = 260
+"""Width of one picture on the contact sheet."""
+SHEET_VIEWS = 6
+"""Views on the contact sheet, at most."""
+SHEET_ROWS = ("truth", "render", "alpha")
+_SHEET_TOP, _SHEET_GAP = 24, 4
+_SUFFIXES = ("png", "jpg", "jpeg", "tif", "tiff", "webp", "bmp")
+
+
+def picture_names(names: Sequence[str]) -> list[str]:
+    """Views' names as file names without suffix: folders become part of the name; all stay different."""
+    flat = [name.replace("\\", "/").strip("/").replace("/", "_") for name in names]
+    stems = [n.rpartition(".")[0] if n.rpartition(".")[2].lower() in _SUFFIXES else n for n in flat]
+    for candidates in (stems, flat):
+        if all(candidates) and len(set(candidates)) == len(names):
+            return candidates
+    return [f"{i:03d}_{name}" for i, name in enumerate(flat)]
+
+
+def to_bytes(image: Tensor) -> np.ndarray:
+    """(H, W, 3) in [0, 1] to uint8, clamped and rounded."""
+    from visdom_plugin.render import quantise
+
+    return (quantise(image) * 255).round().byte().numpy()
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Writes (H, W, 3) RGB or (H, W) grey, uint8, in one step."""
+    import cv2
+
+    ok, data = cv2.imencode(".png", image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
+    if not ok:
+        raise OSError(f"OpenCV could not encode {path}")
+    write_bytes(path, data.tobytes())
+
+
+def shown_on_sheet(count: int) -> list[int]:
+    """Positions of the views that the contact sheet shows, of `count` views, in its order from left to right."""
+    return sorted(set(np.linspace(0, count - 1, min(SHEET_VIEWS, count)).round().astype(int).tolist()))
+
+
+def draw_sheet(columns: list[tuple[str, list[np.ndarray]]], rows: Sequence[str]) -> np.ndarray:
+    """A labelled table of pictures, (H, W, 3) uint8.
+
+    Args:
+        columns: title and one picture (h, w, 3) uint8 per row; sizes may differ.
+        rows: names of the rows.
+    """
+    import cv2
+
+    margin, top, gap = _sheet_margin(rows), _SHEET_TOP, _SHEET_GAP
+    cells = []
+    for _, pictures in columns:
+        h, w = pictures[0].shape[:2]
+        size = (SHEET_WIDTH_PX, _sheet_height(h, w))
+        way = cv2.INTER_AREA if w > SHEET_WIDTH_PX else cv2.INTER_NEAREST
+        cells.append([cv2.resize(p, size, interpolation=way) for p in pictures])
+    row_height = max(p.shape[0] for column in cells for p in column)
+    width = margin + len(columns) * (SHEET_WIDTH_PX + gap)
+    sheet = np.full((top + len(rows) * (row_height + gap), width, 3), 224, np.uint8)
+
+    def write(text: str, x: int, y: int) -> None:
+        cv2.putText(sheet, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+
+    for r, label in enumerate(rows):
+        write(label, 6, top + r * (row_height + gap) + row_height // 2)
+    for c, (title, _) in enumerate(columns):
+        x = margin + c * (SHEET_WIDTH_PX + gap)
+        write(title[-34:].encode("ascii", "replace").decode(), x + 2, 16)
+        for r, picture in enumerate(cells[c]):
+            y = top + r * (row_height + gap)
+            sheet[y : y + picture.shape[0], x : x + SHEET_WIDTH_PX] = picture
+    return sheet
+
+
+def cut_sheet(
+    sheet: np.ndarray, column: int, row: int, rows: Sequence[str], size: tuple[int, int]
+) -> np.ndarray:
+    """One picture of a contact sheet as it is there, (h, SHEET_WIDTH_PX, 3) uint8; the inverse of `draw_sheet`.
+
+    Args:
+        rows: names of the sheet's rows.
+        size: (height, width) of the picture before it was put there.
+    """
+    pitch = (sheet.shape[0] - _SHEET_TOP) // len(rows)
+    x, y = _sheet_margin(rows) + column * (SHEET_WIDTH_PX + _SHEET_GAP), _SHEET_TOP + row * pitch
+    return sheet[y : y + _sheet_height(*size), x : x + SHEET_WIDTH_PX]
+
+
+def _sheet_margin(rows: Sequence[str]) -> int:
+    return max(62, 14 + 8 * max(map(len, rows)))
+
+
+def _sheet_height(height: int, width: int) -> int:
+    return max(1, round(height * SHEET_WIDTH_PX / width))
+
+
+def draw_error(truth: np.ndarray, render: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8: mean absolute difference over channels, black for none, brightest from half the range."""
+    import cv2
+
+    difference = cv2.absdiff(truth, render).astype(np.float32).mean(axis=2)
+    grey = (2 * difference).clip(0, 255).round().astype(np.uint8)
+    return np.ascontiguousarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[..., ::-1])
+
+
+def read_png(path: Path) -> np.ndarray:
+    """What `write_png` wrote of a colour picture, (H, W, 3) uint8 RGB."""
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise OSError(f"{path} is no picture")
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
+def write_video(path: Path, frames: list[np.ndarray], fps: int = 30) -> str:
+    """Writes frames (H, W, 3) uint8 of equal size as mp4: H.264 where PyAV is there, else MPEG-4 by OpenCV.
+
+    H.264 wants even sizes: an odd last row or column is repeated. Returns the codec's name.
+    """
+    h, w = frames[0].shape[:2]
+    frames = [np.pad(f, ((0, h % 2), (0, w % 2), (0, 0)), mode="edge") for f in frames]
+    try:
+        import av
+    except ImportError:
+        av = None
+    with appearing(path) as part:
+        if av is None:
+            _write_mpeg4(part, frames, fps)
+        else:
+            with av.open(str(part), "w") as container:
+                stream = container.add_stream("libx264", rate=fps, options={"crf": "18"})
+                stream.height, stream.width = frames[0].shape[:2]
+                stream.pix_fmt = "yuv420p"
+                for frame in frames:
+                    container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+                container.mux(stream.encode())
+    return "mp4v" if av is None else "h264"
+
+
+def _write_mpeg4(path: Path, frames: list[np.ndarray], fps: int) -> None:
+    import cv2
+
+    h, w = frames[0].shape[:2]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), fps, (w, h))
+    if not writer.isOpened():
+        raise OSError(f"OpenCV could not open {path} for video")
+    for frame in frames:
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()

@@ -1,0 +1,424 @@
+"""Pinhole cameras and rays, batched over leading dimensions.
+
+Conventions, everywhere in this project: camera axes are OpenCV's (x right, y down, z forward); matrices are
+named as maps (`world_from_camera` takes camera coordinates to world coordinates); pixel coordinates `uv_px`
+have their origin at the corner of the image, so that the centre of the first pixel is (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visdom_plugin.errors import SceneError
+from visdom_plugin.geometry.rotations import slerp
+
+
+class Rays(NamedTuple):
+    """Half-lines origin + t * direction, t >= 0."""
+
+    origins: Tensor
+    """(..., 3) world frame."""
+    directions: Tensor
+    """(..., 3) unit length, world frame."""
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """A batch of pinhole cameras of any leading shape, each with its own size and principal point."""
+
+    intrinsics: Tensor
+    """(..., 3, 3) pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
+    world_from_camera: Tensor
+    """(..., 4, 4) rigid motion, OpenCV axes."""
+    width: Tensor
+    """(...) int64 pixels."""
+    height: Tensor
+    """(...) int64 pixels."""
+
+    @classmethod
+    def from_matrices(cls, K, world_from_camera, *, width, height, convention: str = "opencv") -> Cameras:
+        """Cameras from arrays or tensors, checked.
+
+        Args:
+            K: (..., 3, 3) intrinsics in pixels, zero skew.
+            world_from_camera: (..., 4, 4) or (..., 3, 4) camera-to-world motion. This and K may be lists of
+                tensors or arrays, too.
+            width, height: image size in pixels, an int or one per camera (...).
+            convention: axes of `world_from_camera`: "opencv" (y down, z forward) or "opengl" (y up, z backward).
+
+        Returns:
+            Cameras in OpenCV axes, in the motions' floating dtype (float32 for half precision, float64 for
+            integers), on their device, outside any graph.
+
+        Raises:
+            SceneError: for NaN or infinite numbers; a last row of a motion other than (0, 0, 0, 1), or of K other
+                than (0, 0, 1), as transposed matrices have them; a rotation part that is not a rotation; a skewed
+                or non-positive focal length; an empty image; an unknown convention; or counts that do not match.
+        """
+        motion = _as_tensor(world_from_camera)
+        motion = motion if motion.is_floating_point() else motion.double()
+        motion = motion.float() if motion.dtype in (torch.float16, torch.bfloat16) else motion
+        intrinsics = _as_tensor(K).to(motion)
+        if convention not in ("opencv", "opengl"):
+            raise SceneError(
+                f"unknown camera convention {convention!r}",
+                todo='say convention="opencv" (y down, z forward) or convention="opengl" (y up, z backward)',
+            )
+        if intrinsics.shape[-2:] != (3, 3) or motion.shape[-2:] not in ((4, 4), (3, 4)):
+            raise SceneError(
+                f"camera matrices have shapes {tuple(intrinsics.shape)} and {tuple(motion.shape)}",
+                todo="pass K as (..., 3, 3) and world_from_camera as (..., 4, 4) or (..., 3, 4)",
+            )
+        if motion.shape[-2] == 3:
+            last = motion.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*motion.shape[:-2], 1, 4)
+            motion = torch.cat([motion, last], -2)
+        if convention == "opengl":
+            motion = motion * motion.new_tensor([1.0, -1.0, -1.0, 1.0])
+        try:
+            batch = torch.broadcast_shapes(intrinsics.shape[:-2], motion.shape[:-2])
+        except RuntimeError as error:
+            raise SceneError(
+                f"K is for cameras of shape {tuple(intrinsics.shape[:-2])}, "
+                f"world_from_camera for {tuple(motion.shape[:-2])}",
+                todo="pass one K per camera, or one (3, 3) for all",
+            ) from error
+        size = _sizes(batch, motion.device, width=width, height=height)
+        cameras = cls(intrinsics.expand(*batch, 3, 3), motion.expand(*batch, 4, 4), *size)
+        _check(cameras)
+        return cameras
+
+    @classmethod
+    def stack(cls, cameras: Sequence[Cameras]) -> Cameras:
+        """Joins cameras of equal shape along a new first dimension."""
+        names = ("intrinsics", "world_from_camera", "width", "height")
+        return cls(*(torch.stack([getattr(c, name) for c in cameras]) for name in names))
+
+    @property
+    def shape(self) -> torch.Size:
+        """Leading shape of the batch; empty for one camera."""
+        return self.width.shape
+
+    def __len__(self) -> int:
+        return self.width.shape[0]
+
+    def __getitem__(self, index) -> Cameras:
+        return Cameras(
+            self.intrinsics[index], self.world_from_camera[index], self.width[index], self.height[index]
+        )
+
+    def to(self, device=None, dtype: torch.dtype | None = None) -> Cameras:
+        """The same cameras on another device or in another floating dtype."""
+        return Cameras(
+            self.intrinsics.to(device=device, dtype=dtype),
+            self.world_from_camera.to(device=device, dtype=dtype),
+            self.width.to(device=device),
+            self.height.to(device=device),
+        )
+
+    @property
+    def centres(self) -> Tensor:
+        """(..., 3) positions in the world frame."""
+        return self.world_from_camera[..., :3, 3]
+
+    @property
+    def forward(self) -> Tensor:
+        """(..., 3) unit viewing directions (camera +z) in the world frame."""
+        return self.world_from_camera[..., :3, 2]
+
+    @property
+    def camera_from_world(self) -> Tensor:
+        """(..., 4, 4) rigid motion from world to camera coordinates."""
+        rotation = self.world_from_camera[..., :3, :3].mT
+        translation = -(rotation @ self.world_from_camera[..., :3, 3:])
+        return torch.cat([torch.cat([rotation, translation], -1), self.world_from_camera[..., 3:, :]], -2)
+
+    def resized(self, width, height) -> Cameras:
+        """Cameras whose images were resampled to another size, each axis by its own ratio."""
+        width, height = _sizes(self.shape, self.width.device, width=width, height=height)
+        sizes = (width.double() / self.width, height.double() / self.height)
+        ratio = torch.stack([*sizes, torch.ones_like(sizes[0])], -1)
+        return Cameras(
+            self.intrinsics * ratio[..., None].to(self.intrinsics), self.world_from_camera, width, height
+        )
+
+
+def _as_tensor(value) -> Tensor:
+    if isinstance(value, list | tuple) and len(value) and isinstance(value[0], Tensor | np.ndarray):
+        value = torch.stack([_as_tensor(part) for part in value])
+    if isinstance(value, np.ndarray):
+        value = np.ascontiguousarray(value)  # torch knows no negative strides
+    return torch.as_tensor(value).detach()
+
+
+def _sizes(batch: torch.Size, device, **sizes) -> list[Tensor]:
+    """Each of the named sizes as int64 of shape `batch`."""
+    found = []
+    for name, value in sizes.items():
+        value = torch.as_tensor(value, device=device).to(torch.int64)
+        try:
+            found.append(value.expand(batch))
+        except RuntimeError as error:
+            raise SceneError(
+                f"{name} has shape {tuple(value.shape)} for cameras of shape {tuple(batch)}",
+                todo=f"pass one {name} for all cameras, or one per camera",
+            ) from error
+    return found
+
+
+def require_batch(cameras, where: str) -> None:
+    """Refuses anything but a batch (N,) of one camera or more.
+
+    Raises:
+        SceneError: for a sequence of single cameras, a single camera, an empty or a deeper batch.
+    """
+    if not isinstance(cameras, Cameras):
+        several = isinstance(cameras, Sequence) and all(isinstance(c, Cameras) for c in cameras)
+        kind = f"{type(cameras).__name__} of {len(cameras)} Cameras" if several else type(cameras).__name__
+        raise SceneError(
+            f"cameras are a {kind}, not one batch Cameras of shape (N,)",
+            where=where,
+            todo="join single cameras with Cameras.stack(list), or make them with Cameras.from_matrices",
+        )
+    if len(cameras.shape) != 1 or len(cameras) == 0:
+        raise SceneError(
+            f"cameras have shape {tuple(cameras.shape)}, not (N,) with N of 1 or more",
+            where=where,
+            todo="pass the batch of all cameras; cameras[None] is a batch of a single one",
+        )
+
+
+def _check(cameras: Cameras) -> None:
+    for name in ("intrinsics", "world_from_camera"):
+        bad = ~torch.isfinite(getattr(cameras, name)).flatten(-2).all(-1)
+        if bad.any():
+            raise SceneError(
+                f"{name} of {_which(bad)} holds NaN or infinite numbers",
+                cause="the pose estimation failed for this view",
+                todo="drop the view or estimate its pose again",
+            )
+    rotation = cameras.world_from_camera[..., :3, :3]
+    off = (rotation.mT @ rotation - torch.eye(3).to(rotation)).abs().amax((-2, -1))
+    bad = (off > 1e-3) | (torch.linalg.det(rotation.double()) < 0)
+    if bad.any():
+        raise SceneError(
+            f"the upper left 3 x 3 block of world_from_camera of {_which(bad)} is not a rotation",
+            cause="a scaled or mirrored pose, or a matrix in row-major order taken for column-major",
+            todo="remove scale and reflection; pass camera-to-world matrices",
+        )
+    last = cameras.world_from_camera[..., 3, :]
+    bad = ((last - last.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() > 1e-6).any(-1)
+    if bad.any():
+        raise SceneError(
+            f"the last row of world_from_camera of {_which(bad)} is {_row(last, bad)}, not (0, 0, 0, 1)",
+            cause="a transposed matrix, whose position stands in its last row, or a scaled one",
+            todo="pass matrices that map columns, [R t; 0 0 0 1]: transpose them back",
+        )
+    K = cameras.intrinsics
+    form = "pass [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+    last = K[..., 2, :]
+    bad = ((last - last.new_tensor([0.0, 0.0, 1.0])).abs() > 1e-6).any(-1)
+    if bad.any():
+        raise SceneError(
+            f"the last row of the intrinsics of {_which(bad)} is {_row(last, bad)}, not (0, 0, 1)",
+            cause="a transposed matrix, or one that is scaled or has the axes of another convention",
+            todo=form,
+        )
+    skew = torch.maximum(K[..., 0, 1].abs(), K[..., 1, 0].abs())
+    bad = (K[..., 0, 0] <= 0) | (K[..., 1, 1] <= 0) | (skew > 1e-6 * K[..., 0, 0].abs())
+    if bad.any():
+        raise SceneError(f"intrinsics of {_which(bad)} need positive focal lengths and no skew", todo=form)
+    bad = (cameras.width <= 0) | (cameras.height <= 0)
+    if bad.any():
+        raise SceneError(f"width and height of {_which(bad)} must be positive")
+
+
+def _row(rows: Tensor, bad: Tensor) -> str:
+    return "(" + ", ".join(f"{x:.6g}" for x in rows[bad].reshape(-1, rows.shape[-1])[0].tolist()) + ")"
+
+
+def _which(bad: Tensor) -> str:
+    if bad.ndim == 0:
+        return "the camera"
+    indices = bad.flatten().nonzero().flatten().tolist()
+    shown = ", ".join(str(i) for i in indices[:6]) + (", ..." if len(indices) > 6 else "")
+    return f"camera {shown}" if len(indices) == 1 else f"cameras {shown}"
+
+
+def project(cameras: Cameras, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Where points fall in the images.
+
+    Args:
+        cameras: (...) cameras.
+        points: (..., P, 3) world frame; leading dimensions broadcast with the cameras'.
+
+    Returns:
+        uv_px (..., P, 2) pixels, and depth (..., P) along the camera's z axis in scene units. Where
+        depth <= 0 the point lies behind the camera and uv_px means nothing.
+    """
+    world = cameras.camera_from_world.to(points)
+    local = points @ world[..., :3, :3].mT + world[..., None, :3, 3]
+    depth = local[..., 2]
+    homogeneous = local @ cameras.intrinsics.to(points).mT
+    safe = torch.where(depth.abs() < 1e-12, torch.full_like(depth, 1e-12), depth)
+    return homogeneous[..., :2] / safe[..., None], depth
+
+
+def rays_of(cameras: Cameras, uv_px: Tensor | None = None) -> Rays:
+    """Rays through pixels.
+
+    Args:
+        cameras: (...) cameras.
+        uv_px: (..., P, 2) pixel coordinates. None, for a single camera only, means every pixel centre.
+
+    Returns:
+        Rays of shape (..., P, 3), or (H, W, 3) without `uv_px`.
+    """
+    image_shape = None
+    if uv_px is None:
+        if cameras.shape:
+            raise ValueError(
+                "rays_of needs uv_px for a batch of cameras; index one camera for all its pixels"
+            )
+        height, width = int(cameras.height), int(cameras.width)
+        image_shape = (height, width, 3)
+        rows = torch.arange(height, device=cameras.intrinsics.device, dtype=cameras.intrinsics.dtype) + 0.5
+        columns = torch.arange(width, device=cameras.intrinsics.device, dtype=cameras.intrinsics.dtype) + 0.5
+        v, u = torch.meshgrid(rows, columns, indexing="ij")
+        uv_px = torch.stack([u, v], -1).reshape(-1, 2)
+    K = cameras.intrinsics.to(uv_px)
+    x = (uv_px[..., 0] - K[..., None, 0, 2]) / K[..., None, 0, 0]
+    y = (uv_px[..., 1] - K[..., None, 1, 2]) / K[..., None, 1, 1]
+    local = torch.stack([x, y, torch.ones_like(x)], -1)
+    motion = cameras.world_from_camera.to(uv_px)
+    directions = torch.nn.functional.normalize(local @ motion[..., :3, :3].mT, dim=-1)
+    origins = motion[..., None, :3, 3].expand_as(directions)
+    if image_shape is not None:
+        return Rays(origins.reshape(image_shape), directions.reshape(image_shape))
+    return Rays(origins, directions)
+
+
+def pixel_radius(cameras: Cameras) -> Tensor:
+    """Radius of a pixel's cone at distance 1: the pixel's width times 2 / sqrt(12) (mip-NeRF).
+
+    Args:
+        cameras: (...) cameras.
+
+    Returns:
+        (...) float32.
+    """
+    return (2 / math.sqrt(12) / cameras.intrinsics[..., 0, 0]).float()
+
+
+def look_at_point(cameras: Cameras) -> Tensor:
+    """The point closest, in least squares, to all optical axes: what the capture is about.
+
+    Cameras that all look the same way leave the depth open; a small pull towards the point at the cameras'
+    own spread in front of them decides it.
+
+    Args:
+        cameras: (N,) cameras.
+
+    Returns:
+        (3,) world frame.
+    """
+    centres, forward = cameras.centres, cameras.forward
+    spread = (centres - centres.mean(0)).norm(dim=-1).mean().clamp_min(1e-6)
+    across = torch.eye(3).to(centres) - forward[:, :, None] * forward[:, None, :]
+    prior = (centres + spread * forward).mean(0)
+    pull = 1e-6 * len(cameras)
+    matrix = across.sum(0) + pull * torch.eye(3).to(centres)
+    return torch.linalg.solve(matrix, (across @ centres[:, :, None]).sum(0)[:, 0] + pull * prior)
+
+
+def interpolate(start: Cameras, end: Cameras, t: Tensor | float, look_at: Tensor) -> Cameras:
+    """Cameras on the way from one to another that keep a point where it is seen.
+
+    Rotations go along the shortest arc (slerp); the look-at point's camera coordinates go along a line. The
+    camera thus swings round that point instead of cutting through it, and is exactly `start` and `end` at 0
+    and 1.
+
+    Args:
+        start, end: (...) cameras. The result has the size of `start`, and intrinsics interpolated in units of
+            the image size.
+        t: (...) in [0, 1].
+        look_at: (3,) world frame.
+
+    Returns:
+        (...) cameras.
+    """
+    t = torch.as_tensor(t, dtype=start.intrinsics.dtype, device=start.intrinsics.device)
+    look_at = look_at.to(start.world_from_camera)
+    rotation = slerp(start.world_from_camera[..., :3, :3], end.world_from_camera[..., :3, :3], t)
+    seen_from = [
+        (c.camera_from_world @ torch.cat([look_at, look_at.new_ones(1)])[:, None])[..., :3, 0]
+        for c in (start, end)
+    ]
+    local = torch.lerp(*seen_from, t[..., None])
+    centre = look_at - (rotation @ local[..., None])[..., 0]
+    motion = torch.cat(
+        [torch.cat([rotation, centre[..., None]], -1), start.world_from_camera[..., 3:, :]], -2
+    )
+    other = end.resized(start.width, start.height)
+    intrinsics = torch.lerp(start.intrinsics, other.intrinsics, t[..., None, None])
+    return Cameras(intrinsics, motion, start.width, start.height)
+
+
+def look_at_camera(centre: Tensor, target: Tensor, up: Tensor) -> Tensor:
+    """world_from_camera of cameras at `centre` that look at `target`.
+
+    Args:
+        centre, target, up: (..., 3) world frame; `up` need not be perpendicular to the view.
+
+    Returns:
+        (..., 4, 4) motions, OpenCV axes.
+    """
+    z = torch.nn.functional.normalize(target - centre, dim=-1)
+    x = torch.linalg.cross(z, up.expand_as(z))
+    # Looking straight along `up`, any horizontal axis will do.
+    spare = torch.eye(3).to(z)[z.abs().argmin(-1)]
+    x = torch.where(x.norm(dim=-1, keepdim=True) < 1e-6, torch.linalg.cross(z, spare), x)
+    x = torch.nn.functional.normalize(x, dim=-1)
+    y = torch.linalg.cross(z, x)
+    top = torch.stack([x, y, z, centre.expand_as(z)], -1)
+    return torch.cat([top, top.new_tensor([0.0, 0, 0, 1]).expand(*top.shape[:-2], 1, 4)], -2)
+
+
+def orbit(cameras: Cameras, count: int, look_at: Tensor | None = None) -> Cameras:
+    """A full circle around the object at the capture's mean distance and height.
+
+    Args:
+        cameras: (N,) cameras of the capture; intrinsics and size are those of the first.
+        count: number of cameras on the circle.
+        look_at: (3,) centre of the circle; by default the capture's look-at point.
+
+    Returns:
+        (count,) cameras, starting at the first camera's azimuth.
+    """
+    target = look_at_point(cameras) if look_at is None else look_at.to(cameras.world_from_camera)
+    offsets = cameras.centres - target
+    distance = offsets.norm(dim=-1).mean()
+    # Turntables and rings share their mean up; a capture without one (views from above and below) gets z.
+    mean_up = -cameras.world_from_camera[:, :3, 1].mean(0)
+    up = mean_up if mean_up.norm() > 0.3 else mean_up.new_tensor([0.0, 0.0, 1.0])
+    up = up / up.norm()
+    sine = (torch.nn.functional.normalize(offsets, dim=-1) @ up).mean().clamp(-0.95, 0.95)
+    first = offsets[0] - (offsets[0] @ up) * up
+    if first.norm() < 1e-6 * distance:
+        first = torch.linalg.cross(up, torch.eye(3).to(up)[up.abs().argmin()])
+    east = torch.nn.functional.normalize(first, dim=-1)
+    north = torch.linalg.cross(up, east)
+    angle = torch.arange(count).to(up) * (2 * math.pi / count)
+    flat = torch.cos(angle)[:, None] * east + torch.sin(angle)[:, None] * north
+    centres = target + distance * ((1 - sine**2).sqrt() * flat + sine * up)
+    motion = look_at_camera(centres, target, up)
+    one = cameras[0]
+    return Cameras(
+        one.intrinsics.expand(count, 3, 3), motion, one.width.expand(count), one.height.expand(count)
+    )

@@ -1,0 +1,331 @@
+"""Everything that can be found out about a capture from its cameras and masks before anything is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+
+from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.hull.carving.votes import gather_silhouettes
+from visdom_plugin.hull.checks.coverage import look_inverted
+from visdom_plugin.hull.checks.covisibility import LOST, USUAL_K, Advice, advise_k, measure_spread
+from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines, draw_outlines
+from visdom_plugin.hull.checks.explain_failure import ways_to_set_k
+from visdom_plugin.hull.checks.fault_hypotheses import QUIET_PX, Suspicion, explain
+from visdom_plugin.hull.checks.findings import Finding, Name
+from visdom_plugin.hull.checks.mask_checks import check_border, check_content, check_sizes, find_repeated
+from visdom_plugin.hull.checks.pose_conventions import IN_MEMORY, PoseFaults
+from visdom_plugin.hull.checks.silhouette_consistency import Coherence, measure_coherence
+
+CLUSTERED_DEGREES = 60.0
+"""Views within this angle leave a hull more than 1.7 times as deep as the object."""
+_DISAGREE_PX, _SPEAKING_PX = 0.1, 0.5
+_MIDDLE = 0.25
+"""Principal points further than this from the images' centres, in image sizes, are outside their middle half."""
+_RAYS, _BRIEF_VIEWS = 1024, 16
+
+
+@dataclass(frozen=True)
+class Check:
+    """What `check` found."""
+
+    findings: list[Finding]
+    """Faults, most serious first."""
+    notes: list[Finding]
+    """What is worth knowing but does not make the capture faulty."""
+    advice: Advice | None
+    """The K that the views allow; None when there are not two usable views."""
+    fit: Coherence | None
+    """How well the usable views fit together once the faults found are undone."""
+    usable: tuple[int, ...]
+    """Views that `advice` and `fit` speak of."""
+
+
+def check(
+    cameras: Cameras,
+    masks: Sequence,
+    images: Sequence = (),
+    names: Sequence[str] | None = None,
+    *,
+    k: int | None = None,
+    brief: bool = False,
+    poses: PoseFaults = IN_MEMORY,
+) -> Check:
+    """Looks for every fault that shows in cameras and masks, and for photographs that occur twice.
+
+    Args:
+        cameras: (N,) cameras.
+        masks: N tensors or arrays (H, W), True on the object. They need not fit the cameras: that is a finding.
+        images: N tensors or arrays (H, W, 3), or empty to leave them out.
+        names: the views' names, for the sentences.
+        k: the K that is going to be used; by default it is to be advised.
+        brief: a fraction of a second; names a fault but not always its cause, and compares 16 views at most.
+        poses: what to say of wrong poses, in the terms of where they are from.
+    """
+    masks = [np.asarray(m.detach().cpu() if hasattr(m, "detach") else m).astype(bool) for m in masks]
+    names = Name([f"view {i}" for i in range(len(masks))] if names is None else names)
+    sizes = torch.stack([cameras.width, cameras.height], -1).cpu().numpy()
+    found = check_sizes(sizes, masks, names)
+    out = {view for f in found for view in f.views}
+    alone = check_content([m if i not in out else np.eye(2, dtype=bool) for i, m in enumerate(masks)], names)
+    found += alone
+    for f in alone:
+        if f.kind == "speckled":
+            masks[f.views[0]] = cv2.medianBlur(masks[f.views[0]].astype(np.uint8), 3) > 0
+    out |= {f.views[0] for f in alone if f.kind != "speckled"}
+    out |= {i for i, m in enumerate(masks) if not m.any()}
+    usable = np.array([i for i in range(len(masks)) if i not in out], np.int64)
+    repeated = _repeated(masks, images, out, names)
+    if brief and len(usable) > _BRIEF_VIEWS:
+        usable = usable[np.arange(_BRIEF_VIEWS) * len(usable) // _BRIEF_VIEWS]
+    if len(masks) < 2:
+        found.append(_too_few(len(masks)))
+    if len(usable) < 2:
+        notes, found = _split([*found, *repeated])
+        return Check(found, notes, None, None, tuple(usable.tolist()))
+    chosen = cameras[torch.from_numpy(usable)]
+    outlines = draw_outlines(chosen, gather_silhouettes(chosen, [masks[i] for i in usable]))
+    inverted, outlines = _inverted(outlines, masks, usable, names)
+    found += inverted
+    turned = {v for f in inverted for v in f.views}
+    found += check_border([m if i not in turned else ~m for i, m in enumerate(masks)], names)
+    causes, fit, left = explain(outlines, brief=brief, poses=poses)
+    astray = _astray(chosen)
+    if astray and _views_alone(causes, fit):
+        notes, found = _split([*found, *repeated, astray])
+        return Check(found, notes, None, fit, tuple(usable.tolist()))
+    repeated, causes = _join(repeated, causes, usable, names)
+    found += repeated
+    found += [_cause(c, usable, names, poses) for c in causes]
+    ambiguous = any(c.rivals for c in causes)
+    if fit.score > _DISAGREE_PX and not ambiguous:
+        found.append(_disagreement(fit, usable[left], names))
+    rest = outlines.keep(left)
+    advice = None
+    if left.sum() >= 2 and not any(c.kind in ("axes", "scale", "order", "swapped") for c in causes):
+        kept = Name([names[i] for i in usable[left]])
+        advice = advise_k(rest, kept, fit, USUAL_K if k is None else k)
+        found += _covisibility(advice, usable[left], k)
+        found += _clustered(rest, fit, chosen)
+    notes, found = _split(found)
+    found.sort(key=lambda f: ("certain", "likely", "possible").index(f.sure))
+    return Check(found, notes, advice, fit, tuple(usable[left].tolist()))
+
+
+def _split(found: list[Finding]) -> tuple[list[Finding], list[Finding]]:
+    return [f for f in found if f.note], [f for f in found if not f.note]
+
+
+def _too_few(count: int) -> Finding:
+    return Finding(
+        "few",
+        f"there is {'one view' if count else 'no view'} with a mask: nothing says how deep the object is, and no "
+        "hull can be carved",
+        tuple(range(count)),
+        "certain",
+        count,
+        "use more views: --views 3 or more",
+    )
+
+
+def _repeated(masks, images, out: set[int], names: Name) -> list[Finding]:
+    """Photographs and masks that occur twice."""
+    pairs = {p: {"mask"} for p in find_repeated(masks) if not out & set(p)}
+    for p in find_repeated([np.asarray(i) for i in images]):
+        pairs.setdefault(p, set()).add("photograph")
+    return [
+        Finding(
+            "duplicate",
+            f"{names.all_of(pair)} have the same {' and the same '.join(sorted(what))}, pixel for pixel",
+            pair,
+            "certain",
+            1.0,
+            "put the right file in the place of the copy, or leave one of the two views out",
+        )
+        for pair, what in sorted(pairs.items())
+    ]
+
+
+def _inverted(outlines: Outlines, masks, usable: np.ndarray, names: Name):
+    """Masks that hold the border of their image, and fit the others no worse when turned over."""
+    flagged = [k for k, i in enumerate(usable) if look_inverted(masks[i])]
+    if not flagged:
+        return [], outlines
+    rays = max(_RAYS // len(usable), 16)
+    fit = measure_coherence(outlines, rays)
+    fields = tuple(-f if k in flagged else f for k, f in enumerate(outlines.fields))
+    turned = replace(outlines, fields=fields)
+    after = measure_coherence(turned, rays)
+    # A close-up fills its border as well, but it fits as it is and not when turned over.
+    if fit.score <= QUIET_PX and after.score > 10 * QUIET_PX:
+        return [], outlines
+    views = tuple(int(usable[k]) for k in flagged)
+    sound = after.score <= _DISAGREE_PX and after.power > max(_SPEAKING_PX, fit.power)
+    whose = "all masks are" if len(views) == len(masks) else f"the mask of {names[views[0]]} is"
+    if 1 < len(views) < len(masks):
+        whose = f"the masks of {names.all_of(views)} are"
+    evidence = f"turned over, the masks fit together to {after.score / OBJECT_PX:.2%} of the object's length"
+    said = Finding(
+        "inverted",
+        f"{whose} foreground along most of the image's border: background is marked"
+        + (f"; {evidence}" if sound else ""),
+        views,
+        "certain" if sound else "likely",
+        after.score / OBJECT_PX,
+        "invert them: white (True) on the object",
+    )
+    return [said], turned
+
+
+def _astray(cameras: Cameras) -> Finding | None:
+    """Principal points outside the middle half of most images."""
+    K = cameras.intrinsics.double().cpu().numpy()
+    points = K[:, :2, 2]
+    shares = points / torch.stack([cameras.width, cameras.height], -1).cpu().numpy()
+    out = np.abs(shares - 0.5).max(1) > _MIDDLE
+    if 2 * out.sum() <= len(out):
+        return None
+    (x, y), (across, down) = np.median(points, 0), np.median(shares, 0)
+    normalised = bool((points <= 1).all(1).mean() > 0.5)
+    return Finding(
+        "principal",
+        f"the principal points (cx, cy) lie at ({x:.4g}, {y:.4g}) pixels, {across:.0%} of the images' width and "
+        f"{down:.0%} of their height, and the views do not fit together",
+        (),
+        "certain" if normalised else "likely",
+        float(out.mean()),
+        "multiply cx by the width and cy by the height: they are normalised"
+        if normalised
+        else "give cx and cy in pixels from the image's upper left corner, and scale them with the images",
+    )
+
+
+def _views_alone(causes: list[Suspicion], fit: Coherence) -> bool:
+    """Whether something is wrong, and nothing but single views is there to blame."""
+    wrong = bool(causes) or fit.score > _DISAGREE_PX or fit.power < _SPEAKING_PX
+    return wrong and all(c.kind == "view" for c in causes)
+
+
+def _join(repeated: list[Finding], causes: list[Suspicion], usable, names: Name):
+    """A view that does not fit because it has another's mask is one fault, not two."""
+    pairs = {view: k for k, f in enumerate(repeated) for view in f.views}
+    left = []
+    for cause in causes:
+        view = int(usable[cause.views[0]]) if cause.kind == "view" else None
+        if view in pairs and not cause.rivals:
+            k = pairs[view]
+            repeated[k] = repeated[k]._replace(
+                what=f"{repeated[k].what}; {names[view]} is the one that does not fit the others"
+            )
+        elif not (
+            cause.kind == "view" and {int(usable[v]) for v in (*cause.views, *cause.rivals)} & set(pairs)
+        ):
+            left.append(cause)
+    return repeated, left
+
+
+def _share(px: float) -> str:
+    return f"{px / OBJECT_PX:.2%}"
+
+
+_TODO = {
+    "scale": "scale the intrinsics with the images: a photograph resized by s has s times the focal length and "
+    "principal point",
+    "order": "check how images, masks and poses are matched: sort them by the same key",
+    "swapped": "exchange them back, photographs and masks, or their poses",
+    "view": "look at this view's mask and pose, or leave it out",
+}
+
+
+def _cause(cause: Suspicion, usable: np.ndarray, names: Name, poses: PoseFaults) -> Finding:
+    views = tuple(int(usable[v]) for v in cause.views)
+    gain = (
+        f"undone, masks and cameras miss each other by {_share(cause.after)} of the object's length in the "
+    )
+    gain += f"mean in place of {_share(cause.before)}"
+    if cause.kind == "view":
+        gain = (
+            f"without it the other views miss each other by {_share(cause.after)} of the object's length in "
+        )
+        gain += f"the mean, with it by {_share(cause.before)}"
+        what = f"{names[views[0]]} does not fit the others"
+        if cause.rivals:
+            rivals = tuple(int(usable[v]) for v in cause.rivals)
+            views = tuple(sorted((*views, *rivals)))
+            what = f"one of {names.all_of(views)} does not fit the others"
+        what += f" ({cause.detail})" if cause.detail else ""
+    elif cause.kind == "swapped":
+        what = f"photographs and masks of {names.all_of(views)} are exchanged"
+    else:
+        what = cause.detail
+    for kind, others, detail in cause.others[:3]:
+        other = names.all_of([int(usable[v]) for v in others]) + ": " if others else ""
+        what += f"; or {other}{detail}" if kind != "swapped" else f"; or {other}exchanged"
+    if cause.before <= QUIET_PX:
+        gain = "as given, no view rules out anything for another; undone they do, and miss each other by "
+        gain += f"{_share(cause.after)} of the object's length in the mean"
+    ratio = min(cause.after / max(cause.before, 1e-9), 1.0)
+    sure = "certain" if cause.before > _DISAGREE_PX and ratio < 0.1 else "likely"
+    sure = "possible" if cause.rivals or cause.others else sure
+    todo = dict(poses)[cause.detail] if cause.kind == "axes" else _TODO[cause.kind]
+    alternatives = tuple(sorted({kind for kind, _, _ in cause.others}))
+    return Finding(cause.kind, f"{what}: {gain}", views, sure, 1 - ratio, todo, alternatives)
+
+
+def _disagreement(fit: Coherence, views: np.ndarray, names: Name) -> Finding:
+    worst = np.argsort(-np.nan_to_num(fit.contradicted))[:3]
+    named = tuple(int(views[w]) for w in worst)
+    share = float(np.nan_to_num(fit.contradicted)[worst[0]])
+    return Finding(
+        "disagreement",
+        f"masks and cameras contradict each other by {_share(fit.score)} of the object's length in the mean, and "
+        f"no single cause explains it; worst in {names.all_of(named)}",
+        named,
+        "likely" if share > 0.1 else "possible",
+        share,
+        "look at the contact sheet (--out DIR); check poses and intrinsics, then the masks of these views",
+    )
+
+
+def _covisibility(advice: Advice, views: np.ndarray, asked: int | None) -> list[Finding]:
+    wanted = USUAL_K if asked is None else asked
+    if not advice.covered or advice.k >= min(wanted, len(views) if asked is None else wanted):
+        return []
+    if advice.k + 1 not in advice.covered:
+        what, lost = f"K = {wanted} is more than the {len(views)} usable views", np.ones(len(views))
+    else:
+        what = f"too little is seen in common for K = {wanted}: {advice.why}"
+        lost = advice.covered[1] - advice.covered[advice.k + 1]
+    return [
+        Finding(
+            "covisibility",
+            what,
+            tuple(int(v) for v in views[lost > LOST]),
+            "certain",
+            float(lost.max()),
+            f'use {ways_to_set_k(advice.k)} or k="auto", or views that show more of the object in common',
+            note=asked is None and advice.k > 1,
+        )
+    ]
+
+
+def _clustered(outlines: Outlines, fit: Coherence, cameras: Cameras) -> list[Finding]:
+    middle = look_at_point(cameras.to(dtype=torch.float64)).cpu().numpy() if fit.ball is None else fit.ball[0]
+    spread = measure_spread(outlines.centres, middle)
+    if spread.degrees >= CLUSTERED_DEGREES:
+        return []
+    return [
+        Finding(
+            "clustered",
+            f"all views look from within {spread.degrees:.0f} degrees of each other (opposite sides count as "
+            f"one): the hull may be {spread.stretch:.1f} times as deep as the object",
+            (),
+            "certain" if spread.degrees < 0.67 * CLUSTERED_DEGREES else "likely",
+            spread.degrees,
+            "add views from the sides; the visible domain gains little from views of similar directions",
+        )
+    ]

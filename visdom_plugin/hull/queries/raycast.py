@@ -1,0 +1,356 @@
+"""Where rays enter and leave a hull, and what a camera sees of it: voxel traversal, without a mesh.
+
+The grid is cut into bricks of 4 x 4 x 4 voxels, 64 bits each, with the edge of the largest empty cube of bricks
+ahead of every brick, for each of the eight octants a ray may go to. Empty space is crossed in such cubes (after
+sphere tracing in distance fields); inside a brick that holds something the ray crosses empty blocks of 2 x 2 x 2
+voxels, and goes from voxel to voxel (Amanatides and Woo 1987). Crossings are exact: t at the plane between voxels.
+
+A step of any kind leaves a box by the same arithmetic, without a branch, in a grid mirrored so that no ray goes
+back. On the CPU rays walk in packs, each ray of a pack one step per round: what one step waits for the next ray's
+step fills, and no wrongly guessed branch throws work away.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from visdom_plugin.compute.parallel import spread
+from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.hull.hull import Hull, occupied_box
+
+_BRICK = 4
+_FARTHEST = 255
+_PACK = 256
+"""Rays that walk together; their state, 30 KiB, stays in the first cache."""
+_GRAIN = 16 * _PACK
+_EIGHTH, _EVEN = np.uint64(0x330033), np.uint64(0b101010)
+"""Bits of the first 2 x 2 x 2 voxels of a brick; bits of a place that count in steps of two."""
+_NEVER = 1e300
+"""Inverse of a direction of zero: its planes are never reached."""
+
+
+class Crossing(NamedTuple):
+    """Where rays meet a hull."""
+
+    t_first: Tensor
+    """(...) first entry, in units of the direction's length; 0 for an origin inside and for a miss."""
+    t_last: Tensor
+    """(...) last exit, same unit; 0 for a miss."""
+    hit: Tensor
+    """(...) bool."""
+
+
+class Bricks(NamedTuple):
+    """An occupancy grid in bricks."""
+
+    bits: np.ndarray
+    """(A, B, C) uint64, bit x + 4 y + 16 z of a brick is voxel (x, y, z) in it."""
+    ahead: np.ndarray
+    """(8, A, B, C) uint8 edge of the largest empty cube of bricks that has this one in its corner, at most 255. In
+    octant i + 2 j + 4 k it goes to smaller x if i, smaller y if j, smaller z if k; it may leave the grid."""
+
+
+@njit(cache=True, nogil=True)
+def _pack(begin, end, grid, bits):
+    nx, ny, nz = grid.shape
+    for a in range(begin, end):
+        for x in range(4 * a, min(4 * a + 4, nx)):
+            for y in range(ny):
+                base = (x & 3) + 4 * (y & 3)
+                for z in range(nz):
+                    if grid[x, y, z]:
+                        bits[a, y >> 2, z >> 2] |= np.uint64(1) << np.uint64(base + 16 * (z & 3))
+
+
+@njit(cache=True, nogil=True)
+def _look_ahead(begin, end, bits, ahead):
+    """Largest empty cubes by dynamic programming: one more than the smallest of the seven bricks ahead."""
+    na, nb, nc = bits.shape
+    for octant in range(begin, end):
+        i, j, k = 1 - 2 * (octant & 1), 1 - 2 * (octant >> 1 & 1), 1 - 2 * (octant >> 2)
+        for p in range(na):
+            a = na - 1 - p if i > 0 else p
+            for q in range(nb):
+                b = nb - 1 - q if j > 0 else q
+                for r in range(nc):
+                    c = nc - 1 - r if k > 0 else r
+                    best = _FARTHEST - 1
+                    for n in range(1, 8):
+                        u, v, w = a + i * (n & 1), b + j * (n >> 1 & 1), c + k * (n >> 2)
+                        if 0 <= u < na and 0 <= v < nb and 0 <= w < nc:
+                            best = min(best, np.int64(ahead[octant, u, v, w]))
+                    ahead[octant, a, b, c] = 0 if bits[a, b, c] else best + 1
+
+
+def build_bricks(occupancy: np.ndarray) -> Bricks:
+    """Bricks of an (X, Y, Z) bool grid."""
+    shape = tuple(-(-n // _BRICK) for n in occupancy.shape)
+    bits, ahead = np.zeros(shape, np.uint64), np.empty((8, *shape), np.uint8)
+    spread(_pack, shape[0], 1, occupancy.view(np.uint8), bits)
+    spread(_look_ahead, 8, 1, bits, ahead)
+    return Bricks(bits, ahead)
+
+
+@njit(cache=True, nogil=True)
+def _walk_pack(count, rays, turns, hit, active, size, bits, ahead):
+    """Finds where rays first are in an occupied voxel, in a grid turned so that none goes back; units of voxels.
+
+    Args:
+        count: rays in the pack.
+        rays: (P, 14) float64: origin, direction, inverse of the direction, a point in the voxel where the ray is,
+            t of that point, and t at the end.
+        turns: (P, 6) int64: index of a brick from its turned place (factor for each axis, and offset), bits that
+            turn a place inside a brick, and where the octant of `ahead` starts.
+        hit: (P,) bool, comes out: whether the walk ended in an occupied voxel, at the t that is left in `rays`.
+        active: (P,) uint64, room to work in.
+        size: (3,) float64 voxels of the grid in whole bricks.
+        bits, ahead: flat.
+    """
+    for n in range(count):
+        active[n] = n
+    while count > 0:
+        kept = 0
+        for n in range(count):
+            r = active[n]
+            px, py, pz, begin = rays[r, 9], rays[r, 10], rays[r, 11], rays[r, 12]
+            x, y, z = np.int64(px), np.int64(py), np.int64(pz)
+            brick = turns[r, 3] + (x >> 2) * turns[r, 0] + (y >> 2) * turns[r, 1] + (z >> 2) * turns[r, 2]
+            free = np.int64(ahead[np.uint64(brick + turns[r, 5])])
+            word = bits[np.uint64(brick)]
+            at = np.uint64(((x & 3) | (y & 3) << 2 | (z & 3) << 4) ^ turns[r, 4])
+            full = (word >> at) & np.uint64(1) != 0
+            # Leave the empty cube of bricks ahead, or the empty 2 x 2 x 2 voxels, or the voxel.
+            eighth = word & (_EIGHTH << (at & _EVEN))
+            shift, near = np.int64(free != 0) + np.int64(eighth == 0), free + np.int64(free == 0)
+            x1, y1, z1 = (
+                float(((x >> shift) + near) << shift),
+                float(((y >> shift) + near) << shift),
+                float(((z >> shift) + near) << shift),
+            )
+            ox, oy, oz = rays[r, 0], rays[r, 1], rays[r, 2]
+            tx, ty, tz = (x1 - ox) * rays[r, 6], (y1 - oy) * rays[r, 7], (z1 - oz) * rays[r, 8]
+            out = tx if tx < ty else ty
+            out = out if out < tz else tz
+            t = out if out > begin else begin
+            # The axis that leaves goes exactly to the plane; rounding must not push the others over theirs.
+            qx, qy, qz = ox + t * rays[r, 3], oy + t * rays[r, 4], oz + t * rays[r, 5]
+            qx, qy, qz = qx if qx > px else px, qy if qy > py else py, qz if qz > pz else pz
+            qx = qx if qx < x1 - 0.5 else x1 - 0.5
+            qy = qy if qy < y1 - 0.5 else y1 - 0.5
+            qz = qz if qz < z1 - 0.5 else z1 - 0.5
+            qx, qy, qz = x1 if tx == out else qx, y1 if ty == out else qy, z1 if tz == out else qz
+            hit[r] = full
+            rays[r, 9], rays[r, 10], rays[r, 11] = qx, qy, qz
+            rays[r, 12] = begin if full else t
+            on = (not full) & (t < rays[r, 13]) & (qx < size[0]) & (qy < size[1]) & (qz < size[2])
+            active[kept] = r
+            kept += np.int64(on)
+        count = kept
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _set_out(rays, turns, n, begin, end, size, shape):
+    """Fills in the rest of a ray from its origin and direction in the grid as it is."""
+    turns[n, 3], turns[n, 4], octant = 0, 0, 0
+    factor = 1
+    for b in range(3):
+        a = 2 - b
+        o, d = rays[n, a], rays[n, 3 + a]
+        back = d < 0
+        turns[n, a] = -factor if back else factor
+        if back:
+            o, d = size[a] - o, -d
+            turns[n, 3] += factor * (shape[a] - 1)
+            turns[n, 4] |= 3 << (2 * a)
+            octant |= 1 << a
+        factor *= shape[a]
+        rays[n, a], rays[n, 3 + a] = o, d
+        rays[n, 6 + a] = 1.0 / d if d > 0 else _NEVER
+        start = o + begin * d
+        start = start if start > 0 else 0.0
+        rays[n, 9 + a] = start if start < size[a] - 0.5 else size[a] - 0.5
+    turns[n, 5] = octant * factor
+    rays[n, 12], rays[n, 13] = begin, end
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _clip_axis(o, d, low, high, near, far):
+    if d == 0:
+        return (near, far) if low <= o < high else (1.0, 0.0)
+    inverse = 1.0 / d
+    t0, t1 = (low - o) * inverse, (high - o) * inverse
+    t0, t1 = (t0, t1) if t0 < t1 else (t1, t0)
+    return t0 if t0 > near else near, t1 if t1 < far else far
+
+
+@njit(cache=True, nogil=True)
+def _cast(begin, end, origins, directions, lower, scale, box, shape, bits, ahead, both, first, last, hit):
+    # One origin may serve all rays of a camera.
+    step = 0 if len(origins) == 1 else 1
+    size = np.array([4.0 * shape[0], 4.0 * shape[1], 4.0 * shape[2]])
+    rays, turns, ends = np.empty((_PACK, 14)), np.empty((_PACK, 6), np.int64), np.empty((_PACK, 7))
+    met, active, index = np.empty(_PACK, np.bool_), np.empty(_PACK, np.uint64), np.empty(_PACK, np.int64)
+    r = begin
+    while r < end:
+        count = 0
+        while r < end and count < _PACK:
+            first[r], last[r], hit[r] = 0, 0, False
+            near, far, length, reach = 0.0, np.inf, 0.0, 0.0
+            for a in range(3):
+                o, d = (origins[r * step, a] - lower[a]) * scale[a], directions[r, a] * scale[a]
+                near, far = _clip_axis(o, d, box[0, a], box[1, a], near, far)
+                length += d * d
+                reach += abs(o)
+                rays[count, a], rays[count, 3 + a] = o, d
+            # Also rejects NaN.
+            if near < far and length > 0 and reach < np.inf:
+                # The last exit is the first hit from the other end.
+                for a in range(3):
+                    ends[count, a], ends[count, 3 + a] = (
+                        rays[count, a] + far * rays[count, 3 + a],
+                        -rays[count, 3 + a],
+                    )
+                ends[count, 6], index[count] = far, r
+                _set_out(rays, turns, count, near, far, size, shape)
+                count += 1
+            r += 1
+        _walk_pack(count, rays, turns, met, active, size, bits, ahead)
+        hits = 0
+        for n in range(count):
+            if met[n]:
+                t, far = rays[n, 12], ends[n, 6]
+                first[index[n]], hit[index[n]] = t, True
+                rays[hits, :6] = ends[n, :6]
+                ends[hits, 6], index[hits] = far, index[n]
+                _set_out(rays, turns, hits, 0.0, far - t, size, shape)
+                hits += 1
+        if both:
+            _walk_pack(hits, rays, turns, met, active, size, bits, ahead)
+            for n in range(hits):
+                # Rounding may lose a ray that grazes an edge.
+                last[index[n]] = ends[n, 6] - rays[n, 12] if met[n] else first[index[n]]
+
+
+def cast(hull: Hull, origins, directions) -> Crossing:
+    """First entry into and last exit from the occupied voxels, exact to rounding.
+
+    On the CPU numba walks the voxels, on CUDA `march` does it in torch.
+
+    Args:
+        origins, directions: (..., 3) tensors or arrays, broadcast against each other; world frame; directions of
+            any length but zero.
+
+    Returns:
+        Crossing in the rays' dtype (float64 for numpy input), on their device; tensors, without gradient.
+    """
+    origins, directions = (torch.as_tensor(x).detach() for x in (origins, directions))
+    shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
+    dtype = directions.dtype if directions.is_floating_point() else torch.float64
+    if directions.device.type != "cpu":
+        first, last, hit = march(hull, origins, directions)
+        return Crossing(first.to(dtype), last.to(dtype), hit)
+    first, last, hit = _walk(hull, origins, directions, shape, both=True)
+    return Crossing(first.to(dtype), last.to(dtype), hit)
+
+
+def _walk(hull: Hull, origins: Tensor, directions: Tensor, shape, *, both: bool):
+    origins = origins.reshape(1, 3) if origins.numel() == 3 else origins.expand(*shape, 3).reshape(-1, 3)
+    directions = directions.expand(*shape, 3).reshape(-1, 3)
+    if directions.dtype != torch.float32 or origins.dtype != torch.float32:
+        directions, origins = directions.double(), origins.double()
+    directions, origins = directions.contiguous().numpy(), origins.contiguous().numpy()
+    bricks = hull._once("bricks", lambda: build_bricks(hull.occupancy))
+    first, last = np.empty(len(directions)), np.empty(len(directions))
+    hit = np.empty(len(directions), np.bool_)
+    lower, scale = np.array(hull.bounds[0]), 1 / hull.voxel_edges
+    box = hull._once("box", lambda: occupied_box(hull.occupancy).astype(float))
+    shaped = (np.array(bricks.bits.shape), bricks.bits.reshape(-1), bricks.ahead.reshape(-1))
+    inputs = (origins, directions, lower, scale, box, *shaped, both)
+    spread(_cast, len(directions), _GRAIN, *inputs, first, last, hit)
+    return tuple(torch.from_numpy(x).reshape(shape) for x in (first, last, hit))
+
+
+def march(hull: Hull, origins: Tensor, directions: Tensor) -> Crossing:
+    """`cast` in torch on the rays' device: all rays advance together through the brick distances.
+
+    Same arguments and result as `cast`, in float64.
+    """
+    shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
+    device = directions.device
+    lower, edges = (torch.as_tensor(x, device=device) for x in (hull.bounds[0].copy(), hull.voxel_edges))
+    o = ((origins.detach().double() - lower) / edges).expand(*shape, 3).reshape(-1, 3)
+    d = (directions.detach().double() / edges).expand(*shape, 3).reshape(-1, 3)
+    low, high = torch.as_tensor(occupied_box(hull.occupancy), device=device)
+    planes = torch.stack([(low - o) / d, (high - o) / d])
+    within = (o >= low) & (o < high)
+    planes = torch.where(d == 0, torch.where(within, torch.inf, torch.nan), planes)
+    near = torch.where(d == 0, -planes[0], planes.amin(0)).amax(-1).clamp_min(0)
+    far = planes.amax(0).amin(-1)
+    alive = (near < far) & (d.square().sum(-1) > 0) & torch.isfinite(far)
+    first = _march_ahead(hull, o, d, near, far, alive)
+    hit = first >= 0
+    end = torch.where(hit, far, 0.0)[:, None]
+    back = _march_ahead(hull, o + end * d, -d, torch.zeros_like(far), far - first, hit)
+    last = torch.where(back >= 0, far - back, first)
+    results = (torch.where(hit, first, 0.0), torch.where(hit, last, 0.0), hit)
+    return Crossing(*(x.reshape(shape) for x in results))
+
+
+def _march_ahead(hull: Hull, o: Tensor, d: Tensor, begin: Tensor, end: Tensor, alive: Tensor) -> Tensor:
+    bricks = hull._once("bricks", lambda: build_bricks(hull.occupancy))
+    device = o.device
+    distance = hull._once(("distance", str(device)), lambda: torch.from_numpy(bricks.ahead.min(0)).to(device))
+    grid = hull._grid_on(device)
+    size = torch.tensor(hull.shape, device=device)
+    found = torch.full_like(begin, -1.0)
+    rays = alive.nonzero()[:, 0]
+    o, d, t, end = o[rays], d[rays], begin[rays], end[rays]
+    voxel = torch.floor(o + t[:, None] * d).long().clamp_min(0).minimum(size - 1)
+    while len(rays):
+        brick = voxel // _BRICK
+        free = distance[tuple(brick.T)].long()
+        stop = (free == 0) & grid[tuple(voxel.T)]
+        found[rays[stop]] = t[stop]
+        # The empty cube around the voxel: of bricks, or the voxel alone in a brick that holds something.
+        single = (free == 0)[:, None]
+        low = torch.where(single, voxel, _BRICK * (brick - free[:, None] + 1))
+        high = torch.where(single, voxel + 1, _BRICK * (brick + free[:, None]))
+        planes = torch.where(d == 0, torch.inf, (torch.where(d > 0, high, low) - o) / d)
+        out = planes.amin(-1)
+        t = torch.maximum(t, out)
+        inside = torch.floor(o + t[:, None] * d).long().maximum(low).minimum(high - 1)
+        voxel = torch.where(planes == out[:, None], torch.where(d > 0, high, low - 1), inside)
+        on = ~stop & (t < end) & ((voxel >= 0) & (voxel < size)).all(-1)
+        rays, o, d, t, end, voxel = (x[on] for x in (rays, o, d, t, end, voxel))
+    return found
+
+
+def depth_and_silhouette(hull: Hull, camera: Cameras) -> tuple[Tensor, Tensor]:
+    """What one camera sees of the hull.
+
+    Args:
+        camera: one camera, shape ().
+
+    Returns:
+        depth (H, W) float32 along the camera's z axis in scene units, 0 beside the hull; and mask (H, W) bool,
+        True where the ray through the pixel's centre meets the hull. On the camera's device.
+    """
+    K, motion = camera.intrinsics.double(), camera.world_from_camera.double()
+    height, width = int(camera.height), int(camera.width)
+    columns = torch.arange(width, dtype=torch.float64, device=K.device) + 0.5
+    rows = torch.arange(height, dtype=torch.float64, device=K.device) + 0.5
+    x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
+    # Directions of camera depth 1, so that t is the depth along z.
+    right, down, ahead = motion[:3, 0], motion[:3, 1], motion[:3, 2]
+    directions = x[:, None] * right + (y[:, None] * down + ahead)[:, None, :]
+    origin = motion[:3, 3]
+    if directions.device.type != "cpu":
+        crossing = march(hull, origin, directions)
+        return crossing.t_first.float(), crossing.hit
+    first, _, hit = _walk(hull, origin, directions, (height, width), both=False)
+    return first.float(), hit

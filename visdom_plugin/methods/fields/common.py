@@ -1,0 +1,212 @@
+"""What all radiance fields share: rays in the field's frame, images from rays, a mesh from density."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visdom_plugin.geometry.cameras import Cameras, pixel_radius, rays_of
+from visdom_plugin.hooks.protocols import SamplerHook
+from visdom_plugin.losses import composite, mask_loss
+from visdom_plugin.nerf.frame import Frame
+from visdom_plugin.render import Render
+
+log = logging.getLogger(__name__)
+
+
+class LocalRays(NamedTuple):
+    """Rays in the field's frame, with the bounds of their samples."""
+
+    origins: Tensor
+    """(n, 3) float32."""
+    directions: Tensor
+    """(n, 3) float32, unit."""
+    near: Tensor
+    """(n,)."""
+    far: Tensor
+    """(n,)."""
+    hit: Tensor
+    """(n,) bool: the visible-domain hook found the hull; True for all without one."""
+
+
+def bound_rays(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    frame: Frame,
+    hooks: Sequence[SamplerHook],
+) -> LocalRays:
+    """Rays in the field's frame, bounded by every hook in turn.
+
+    Args:
+        origins, directions: (n, 3) world frame; directions unit.
+        near, far: (n,) the method's own bounds, in the field's frame.
+        hooks: they see the world frame.
+    """
+    hit = torch.ones_like(near, dtype=torch.bool)
+    for hook in hooks:
+        bounds = hook.bound(origins, directions, near / frame.scale, far / frame.scale)
+        near, far, hit = bounds.near * frame.scale, bounds.far * frame.scale, hit & bounds.hit
+    return LocalRays(frame.to_local(origins), directions.float(), near.float(), far.float(), hit)
+
+
+def spread_rays(camera: Cameras, most: int = 256) -> tuple[Tensor, Tensor]:
+    """Origins and directions (n, 3) of a camera's pixels, at most `most` evenly chosen along each side."""
+    height, width = int(camera.height), int(camera.width)
+    device = camera.intrinsics.device
+    v, u = (
+        torch.linspace(0.5, size - 0.5, min(size, most), dtype=torch.float64, device=device)
+        for size in (height, width)
+    )
+    grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2)
+    return rays_of(camera.to(dtype=torch.float64), grid)
+
+
+def warm_up(method: Any, camera: Cameras) -> None:
+    """Compiles the CPU kernels of a step, or loads them, on 16 pixels; the gradients are dropped."""
+    log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
+    origins, directions = (x.float() for x in spread_rays(camera, 4))
+    n = len(origins)
+    batch = SimpleNamespace(
+        origins=origins,
+        directions=directions,
+        rgb=torch.rand(n, 3, generator=torch.Generator().manual_seed(0)),
+        mask=torch.ones(n),
+        radii=pixel_radius(camera).expand(n),
+        mask_known=None,
+    )
+    sum(method.train_step(batch, 1).values()).backward()
+    method.optimiser.adam.zero_grad(set_to_none=True)
+
+
+def photograph_on(background: Tensor, batch: Any, alpha: Tensor) -> Tensor:
+    """What a batch of pixels should look like on `background` (n, 3); see `losses.composite`."""
+    return composite(batch.rgb, batch.mask, background, alpha=alpha, mask_known=batch.mask_known)
+
+
+def silhouette_loss(alpha: Tensor, batch: Any) -> Tensor:
+    """Binary cross entropy between opacity (n,) and mask, over the pixels whose mask is known."""
+    return mask_loss(alpha, batch.mask, None if batch.mask_known is None else batch.mask_known.float())
+
+
+def render_image(
+    camera: Cameras,
+    render_rays: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]],
+    frame: Frame,
+    chunk: int,
+) -> Render:
+    """One view, without gradients.
+
+    Args:
+        camera: one camera, shape ().
+        render_rays: origins and directions (n, 3), world frame, to colour (n, 3) over the background, opacity
+            (n,), and depth (n,) along the ray in the field's frame.
+        chunk: rays at a time.
+    """
+    rays = rays_of(camera.to(dtype=torch.float64))
+    shape = rays.origins.shape[:2]
+    origins, directions = rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)
+    with torch.no_grad():
+        parts = [
+            render_rays(origins[i : i + chunk], directions[i : i + chunk])
+            for i in range(0, len(origins), chunk)
+        ]
+    rgb, alpha, distance = (torch.cat(x) for x in zip(*parts, strict=True))
+    along = (directions @ camera.forward.to(directions)).float()
+    depth = torch.where(alpha > 0, distance * along / frame.scale, 0)
+    return Render(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape))
+
+
+def mesh_density(
+    density_of: Callable[[Tensor], Tensor],
+    colour_of: Callable[[Tensor, Tensor], Tensor],
+    frame: Frame,
+    half_side: float,
+    *,
+    resolution: int = 160,
+    smallest_piece: float = 0.01,
+    chunk: int = 1 << 17,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """The surface where the field is half opaque over a thirtieth of the object, by marching cubes, world frame.
+
+    Whatever the resolution, the level is the same. A coarse look at the whole cube finds the object's box.
+
+    Args:
+        density_of: points (m, 3) in the field's frame to density (m,) per unit of that frame.
+        colour_of: points and viewing directions (m, 3) to rgb (m, 3) in [0, 1].
+        half_side: of the cube around the frame's origin.
+        resolution: voxels along the longest side of the box.
+        smallest_piece: pieces with fewer voxels than this share of the largest one are left out.
+
+    Returns:
+        vertices (V, 3) float64 world frame, faces (F, 3) int64 outward, and rgb (V, 3) uint8 as seen from
+        outside along the normal; None where nothing is opaque.
+    """
+    from scipy.ndimage import label
+    from skimage.measure import marching_cubes
+    from trimesh import Trimesh
+
+    def sample(lower: np.ndarray, step: float, shape: Sequence[int]) -> np.ndarray:
+        axes = [torch.from_numpy(lower[a] + step * (np.arange(shape[a]) + 0.5)).float() for a in range(3)]
+        points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        with torch.no_grad():
+            parts = [density_of(points[i : i + chunk]).cpu() for i in range(0, len(points), chunk)]
+        return torch.cat(parts).reshape(*shape).numpy()
+
+    def main_pieces(opaque: np.ndarray) -> np.ndarray:
+        pieces, count = label(opaque)
+        sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+        sizes[0] = 0
+        return (sizes >= smallest_piece * sizes.max(initial=1))[pieces]
+
+    step = 2 * half_side / 64
+    # exp(-density * length) = 1/2; coarse cells may hold thin parts, so less is asked of them.
+    coarse = sample(np.full(3, -half_side), step, (64,) * 3) > 0.25 * math.log(2) / step
+    opaque = np.argwhere(main_pieces(coarse) & coarse)
+    if not len(opaque):
+        return None
+    lower = -half_side + step * (opaque.min(0) - 1)
+    upper = -half_side + step * (opaque.max(0) + 2)
+    extent = float((upper - lower).max())
+    step = extent / resolution
+    values = sample(lower, step, np.ceil((upper - lower) / step).astype(int))
+    level = math.log(2) / (extent / 30)
+    small = (values > level) & ~main_pieces(values > level)
+    values = np.pad(np.where(small, 0, values), 1)
+    if not values.max() > level:
+        return None
+    # The logarithm of an exponential field is close to linear between voxels. Skimage's "ascent" faces outwards.
+    vertices, faces, _, _ = marching_cubes(
+        np.log(values + 1e-6), math.log(level), gradient_direction="ascent"
+    )
+    local = lower + step * (vertices - 0.5)
+    outward = Trimesh(local, faces, process=False).vertex_normals
+    points, inward = torch.from_numpy(local).float(), torch.from_numpy(-outward).float()
+    with torch.no_grad():
+        parts = [
+            colour_of(points[i : i + chunk], inward[i : i + chunk]).cpu()
+            for i in range(0, len(points), chunk)
+        ]
+    rgb = (torch.cat(parts).clamp(0, 1) * 255).round().byte().numpy()
+    return frame.to_world(torch.from_numpy(local)).numpy(), faces.astype(np.int64), rgb
+
+
+def export_mesh(path: Path, mesh: tuple[np.ndarray, np.ndarray, np.ndarray] | None) -> list[Path]:
+    """Writes the mesh as PLY with vertex colours; nothing, with a warning, where there is none."""
+    if mesh is None:
+        log.warning("no mesh is exported: nowhere is the field half opaque")
+        return []
+    import trimesh
+
+    vertices, faces, rgb = mesh
+    trimesh.Trimesh(vertices, faces, vertex_colors=rgb, process=False).export(path)
+    return [path]

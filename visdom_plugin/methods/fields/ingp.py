@@ -1,0 +1,216 @@
+"""Instant-NGP (Müller et al. 2022): a hash grid, two small networks and an occupancy grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.hooks.protocols import SamplerHook
+from visdom_plugin.methods.fields.common import (
+    LocalRays,
+    bound_rays,
+    export_mesh,
+    mesh_density,
+    photograph_on,
+    render_image,
+    silhouette_loss,
+    spread_rays,
+    warm_up,
+)
+from visdom_plugin.methods.fields.configs import IngpConfig
+from visdom_plugin.nerf.encoding.hash_grid import encode, initial_table
+from visdom_plugin.nerf.encoding.view_directions import encode_harmonics
+from visdom_plugin.nerf.frame import frame_of
+from visdom_plugin.nerf.mlp import perceptron, truncated_exp
+from visdom_plugin.nerf.optimiser import FieldOptimiser, warm_up_and_steps
+from visdom_plugin.nerf.rendering.volume_packed import composite_packed
+from visdom_plugin.nerf.sampling.occupancy_grid import (
+    OccupancyGrid,
+    PackedSamples,
+    intersect_cube,
+    march,
+    select,
+)
+from visdom_plugin.render import Render
+from visdom_plugin.scene import Views
+from visdom_plugin.seeding import generator
+
+HUBER_DELTA = 0.1  # Instant-NGP
+RAYS_AT_ONCE = 1 << 14
+LEAST_RAYS = 64
+
+
+class Ingp:
+    """See `visdom_plugin.training.protocols.Method` for what each call does."""
+
+    def __init__(self, config: IngpConfig):
+        self.config = config
+        self.total_steps = config.steps
+
+    def setup(
+        self, views: Views, hooks: Sequence[SamplerHook], *, hull, device: torch.device, seed: int
+    ) -> None:
+        c = self.config
+        self.device, self.seed, self.hooks = device, seed, list(hooks)
+        self.frame = frame_of(views.cameras)
+        draw = generator(seed, "field")
+        self.table = torch.nn.Parameter(initial_table(c.grid, draw).to(device))
+        self.density_net = perceptron([c.grid.width, c.hidden, 1 + c.geometry_features], draw).to(device)
+        self.colour_net = perceptron(
+            [c.view_degree**2 + c.geometry_features, c.hidden, c.hidden, 3], draw
+        ).to(device)
+        nets = {f"density_net.{k}": p for k, p in self.density_net.named_parameters()}
+        nets |= {f"colour_net.{k}": p for k, p in self.colour_net.named_parameters()}
+        self.optimiser = FieldOptimiser(
+            [({"table": self.table}, 0.0), (nets, c.weight_decay)], betas=(0.9, 0.99), eps=1e-15
+        )
+        self.occupancy = OccupancyGrid(
+            c.occupancy_resolution, c.half_side, c.occupancy_alpha / c.step_length, device=device
+        )
+        if c.drop_unsampled:
+            # VaxNeRF's novel views do look at what training leaves out, so the grid must not hide it.
+            hooks = [] if c.vd.drop_outside else self.hooks
+            parts = [self._bound(*spread_rays(views.cameras[i].to(device)), hooks) for i in range(len(views))]
+            rays = LocalRays(*(torch.cat(x) for x in zip(*parts, strict=True)))
+            self.occupancy.restrict(rays.origins, rays.directions, rays.near, rays.far)
+        self.metrics: dict[str, float] = {}
+        if device.type == "cpu":
+            warm_up(self, views.cameras[0])
+        self._rays = LEAST_RAYS
+
+    def pixels_per_step(self, step: int) -> int:
+        """Pixels the next batch should have."""
+        return self._rays
+
+    def train_step(self, batch, step: int) -> dict[str, Tensor]:
+        c = self.config
+        draw = generator(self.seed, "step", step)
+        if step % c.occupancy_every == 0:
+            fraction = 1.0 if step < c.occupancy_warm_up else c.occupancy_fraction
+            self.occupancy.update(self._density, generator(self.seed, "occupancy", step), fraction=fraction)
+        n = len(batch.mask)
+        background = torch.rand(n, 3, generator=draw) if c.background == "random" else torch.ones(n, 3)
+        background = background.to(self.device)
+        rays = self._bound(batch.origins, batch.directions, self.hooks)
+        step_length = torch.where(rays.hit, c.step_length, c.missing_step_length)
+        shift = torch.rand(n, generator=draw).to(self.device)
+        samples = self._march(rays, rays.far, step_length, shift, self.hooks)
+        rgb, alpha, _ = self._shade(rays, samples, background)
+        target = photograph_on(background, batch, alpha)
+        self.metrics = {"psnr": float(-10 * (rgb.detach() - target).square().mean().clamp_min(1e-10).log10())}
+        self._adapt(n, len(samples.ray))
+        losses = {"colour": torch.nn.functional.huber_loss(rgb, target, delta=HUBER_DELTA) / HUBER_DELTA}
+        if c.mask_weight:
+            losses["mask"] = c.mask_weight * silhouette_loss(alpha, batch)
+        return losses
+
+    def optimise(self, step: int) -> None:
+        c = self.config
+        lr = warm_up_and_steps(
+            step, c.steps, base=c.lr, warm_up=c.lr_warm_up, factor=c.lr_factor, at=(0.5, 0.75, 0.9)
+        )
+        self.optimiser.step(lr)
+
+    @torch.no_grad()
+    def render(self, camera: Cameras, background: Tensor) -> Render:
+        hooks = self._hooks_at_inference()
+        background = background.to(self.device)
+
+        def render_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            rays = self._bound(origins, directions, hooks)
+            far = torch.where(rays.hit, rays.far, rays.near)
+            step_length = torch.full_like(far, self.config.step_length)
+            shift = torch.zeros_like(far)
+            samples = self._march(rays, far, step_length, shift, hooks)
+            return self._shade(rays, samples, background.expand(len(far), 3))
+
+        return render_image(camera.to(self.device), render_rays, self.frame, RAYS_AT_ONCE)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        occupancy = {f"occupancy.{k}": v for k, v in self.occupancy.state_dict().items()}
+        return self.optimiser.state_dict() | occupancy | {"rays": torch.tensor(self._rays)}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.optimiser.load_state_dict(state)
+        prefix = "occupancy."
+        self.occupancy.load_state_dict(
+            {k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)}
+        )
+        self._rays = int(state["rays"])
+
+    def export(self, folder: Path) -> list[Path]:
+        def density_of(points: Tensor) -> Tensor:
+            # What rendering skips is not there.
+            points = points.to(self.device)
+            there = self.occupancy.is_occupied(points)
+            for hook in _filters(self._hooks_at_inference()):
+                there &= hook.keep(self.frame.to_world(points))
+            return torch.where(there, self._density(points), 0)
+
+        mesh = mesh_density(density_of, self._colour, self.frame, self.config.half_side)
+        return export_mesh(Path(folder) / "mesh.ply", mesh)
+
+    def _hooks_at_inference(self) -> list[SamplerHook]:
+        return self.hooks if self.config.vd.hull_at_inference else []
+
+    def _bound(self, origins: Tensor, directions: Tensor, hooks: Sequence[SamplerHook]) -> LocalRays:
+        enter, leave = intersect_cube(self.frame.to_local(origins), directions.float(), self.config.half_side)
+        near = enter.clamp_min(self.config.near)
+        return bound_rays(origins, directions, near, torch.maximum(leave, near), self.frame, hooks)
+
+    def _march(
+        self, rays: LocalRays, far: Tensor, step_length: Tensor, shift: Tensor, hooks
+    ) -> PackedSamples:
+        samples = march(rays.origins, rays.directions, rays.near, far, step_length, shift, self.occupancy)
+        for hook in _filters(hooks):
+            samples = select(samples, hook.keep(self.frame.to_world(_points(rays, samples))))
+        return samples
+
+    def _features(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        c = self.config
+        unit = points * (0.5 / c.half_side) + 0.5
+        out = self.density_net(encode(unit, self.table, c.grid))
+        return truncated_exp(out[:, 0] + c.density_bias), out[:, 1:]
+
+    def _density(self, points: Tensor) -> Tensor:
+        return self._features(points.to(self.device))[0]
+
+    def _colour(self, points: Tensor, directions: Tensor) -> Tensor:
+        _, features = self._features(points.to(self.device))
+        return self._look(features, directions.to(self.device))
+
+    def _look(self, features: Tensor, directions: Tensor) -> Tensor:
+        return self.colour_net(torch.cat([features, self._encode_views(directions)], -1)).sigmoid()
+
+    def _encode_views(self, directions: Tensor) -> Tensor:
+        return encode_harmonics(directions)[..., : self.config.view_degree**2]
+
+    def _shade(self, rays: LocalRays, samples: PackedSamples, background: Tensor):
+        density, features = self._features(_points(rays, samples))
+        # Harmonics once per ray, then spread to its samples.
+        views = self._encode_views(rays.directions)[samples.ray]
+        colours = self.colour_net(torch.cat([features, views], -1)).sigmoid()
+        rgb, alpha, depth, _ = composite_packed(
+            density, colours, samples.starts, samples.ends, samples.ray_offsets, background
+        )
+        return rgb, alpha, depth
+
+    def _adapt(self, rays: int, samples: int) -> None:
+        wanted = int(rays * self.config.samples_per_step / max(samples, 1))
+        # At most doubled: right after the first cullings rays may carry no sample at all.
+        self._rays = max(LEAST_RAYS, min(wanted, 2 * rays, self.config.max_rays))
+
+
+def _filters(hooks: Sequence[SamplerHook]) -> list[SamplerHook]:
+    """The hooks that have a say about single samples, too."""
+    return [hook for hook in hooks if getattr(hook, "drop_outside", False)]
+
+
+def _points(rays: LocalRays, samples: PackedSamples) -> Tensor:
+    """(M, 3) where the field is asked: the middles of the intervals, in the field's frame."""
+    middles = (samples.starts + samples.ends) / 2
+    return rays.origins[samples.ray] + middles[:, None] * rays.directions[samples.ray]

@@ -1,0 +1,276 @@
+"""Zip-NeRF (Barron et al. 2023) at a size for small captures: two proposals and a field, all anti-aliased."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from visdom_plugin.geometry.cameras import Cameras, pixel_radius
+from visdom_plugin.hooks.protocols import SamplerHook
+from visdom_plugin.methods.fields.common import (
+    LocalRays,
+    bound_rays,
+    export_mesh,
+    mesh_density,
+    photograph_on,
+    render_image,
+    silhouette_loss,
+    warm_up,
+)
+from visdom_plugin.methods.fields.configs import ZipNerfConfig
+from visdom_plugin.nerf.encoding.hash_grid import (
+    HashLayout,
+    encode_mean,
+    initial_table,
+    mean_square_per_level,
+)
+from visdom_plugin.nerf.encoding.view_directions import encode_sinusoids
+from visdom_plugin.nerf.frame import frame_of
+from visdom_plugin.nerf.mlp import perceptron, truncated_exp
+from visdom_plugin.nerf.optimiser import FieldOptimiser, warm_up_and_decay
+from visdom_plugin.nerf.rendering.proposal_losses import antialiased_interlevel_loss, distortion_loss
+from visdom_plugin.nerf.rendering.volume import composite, weights_from_density
+from visdom_plugin.nerf.sampling.contraction import contract
+from visdom_plugin.nerf.sampling.multisampling import multisample
+from visdom_plugin.nerf.sampling.ray_warp import curve_distances, distances_of
+from visdom_plugin.nerf.sampling.step_functions import anneal, sample_edges
+from visdom_plugin.render import Render
+from visdom_plugin.scene import Views
+from visdom_plugin.seeding import generator
+
+RAYS_AT_ONCE = 1 << 12
+CHARBONNIER = 0.001  # Zip-NeRF
+RGB_PADDING = 0.001  # mip-NeRF
+INITIAL_FEATURE = 1e-4
+LEVELS = ("coarse", "fine", "field")
+INVISIBLE = 1 / 255
+"""Opacity of a whole ray: one step of an 8-bit image."""
+
+
+class AntialiasedGrid(nn.Module):
+    """A hash grid over contracted space, and one hidden layer behind it. The first output is the density's."""
+
+    def __init__(self, layout: HashLayout, hidden: int, outputs: int, draw: torch.Generator):
+        super().__init__()
+        self.layout = layout
+        self.table = nn.Parameter(initial_table(layout, draw, INITIAL_FEATURE))
+        # Features, and for each level how much of it the sample is too large for.
+        self.net = perceptron([layout.width + layout.levels, hidden, outputs], draw)
+
+    def forward(self, points: Tensor, std: Tensor) -> Tensor:
+        """(..., S, 3) points in the local frame and (..., S) standard deviations to (..., outputs)."""
+        contracted, std = contract(points, std)
+        features, weights = encode_mean(contracted * 0.25 + 0.5, std * 0.25, self.table, self.layout)
+        magnitude = (INITIAL_FEATURE**2 + mean_square_per_level(self.table.detach(), self.layout)).sqrt()
+        return self.net(torch.cat([features, (2 * weights - 1) * magnitude], -1))
+
+    def decay(self) -> Tensor:
+        """Mean squares of the table, summed over the levels."""
+        return mean_square_per_level(self.table, self.layout).sum()
+
+
+class ColourNet(nn.Module):
+    """Hidden layers whose input joins again before the last of them."""
+
+    def __init__(self, inputs: int, hidden: int, layers: int, draw: torch.Generator):
+        super().__init__()
+        self.layers = nn.ModuleList()
+        width = inputs
+        for i in range(layers):
+            if i and i + 1 == layers:
+                width += inputs
+            self.layers.append(perceptron([width, hidden, hidden], draw, bias=True)[0])
+            width = hidden
+        self.last = perceptron([width, 3], draw, bias=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = x
+        for i, layer in enumerate(self.layers):
+            if i and i + 1 == len(self.layers):
+                h = torch.cat([h, x], -1)
+            h = layer(h).relu()
+        return self.last(h).sigmoid() * (1 + 2 * RGB_PADDING) - RGB_PADDING
+
+
+class Level(NamedTuple):
+    """What one level sees along rays."""
+
+    s: Tensor
+    """(n, S + 1) normalised edges."""
+    t: Tensor
+    """(n, S + 1) edges in the local frame."""
+    weights: Tensor
+    """(n, S)."""
+
+
+class ZipNerfLite:
+    """See `visdom_plugin.training.protocols.Method` for what each call does."""
+
+    def __init__(self, config: ZipNerfConfig):
+        self.config = config
+        self.total_steps = config.steps
+
+    def setup(
+        self, views: Views, hooks: Sequence[SamplerHook], *, hull, device: torch.device, seed: int
+    ) -> None:
+        c = self.config
+        self.device, self.seed, self.hooks = device, seed, list(hooks)
+        self.frame = frame_of(views.cameras)
+        draw = generator(seed, "field")
+        self.model = nn.ModuleDict(
+            {
+                "coarse": AntialiasedGrid(c.coarse_grid, c.hidden, 1, draw),
+                "fine": AntialiasedGrid(c.fine_grid, c.hidden, 1, draw),
+                "field": AntialiasedGrid(c.grid, c.hidden, 1 + c.bottleneck, draw),
+                "colour": ColourNet(
+                    c.bottleneck + 3 + 6 * c.view_degree, c.colour_hidden, c.colour_layers, draw
+                ),
+            }
+        ).to(device)
+        named = dict(self.model.named_parameters())
+        self.optimiser = FieldOptimiser([(named, 0.0)], betas=(0.9, 0.99), eps=1e-15)
+        self.metrics: dict[str, float] = {}
+        if device.type == "cpu":
+            warm_up(self, views.cameras[0])
+
+    def pixels_per_step(self, step: int) -> int:
+        return self.config.rays
+
+    def train_step(self, batch, step: int) -> dict[str, Tensor]:
+        c = self.config
+        draw = generator(self.seed, "step", step)
+        n = len(batch.mask)
+        background = torch.rand(n, 3, generator=draw) if c.background == "random" else torch.ones(n, 3)
+        background = background.to(self.device)
+        rays = self._bound(batch.origins, batch.directions, self.hooks)
+        progress = step / max(c.steps, 1)
+        levels, colours = self._see(rays, batch.radii, c.samples, progress, draw)
+        last = levels[-1]
+        rgb, alpha, _ = composite(last.weights, colours, last.t, background)
+        target = photograph_on(background, batch, alpha)
+        error = rgb - target
+        self.metrics = {"psnr": float(-10 * error.detach().square().mean().clamp_min(1e-10).log10())}
+        losses = {"colour": (error.square() + CHARBONNIER**2).sqrt().mean()}
+        if c.mask_weight:
+            losses["mask"] = c.mask_weight * silhouette_loss(alpha, batch)
+        if c.interlevel_weight:
+            loss = sum(
+                antialiased_interlevel_loss(
+                    last.s, last.weights.detach(), level.s, level.weights, width
+                ).mean()
+                / level.weights.shape[-1]
+                for level, width in zip(levels[:-1], c.blur, strict=True)
+            )
+            losses["interlevel"] = c.interlevel_weight * loss
+        if c.distortion_weight:
+            loss = distortion_loss(curve_distances(last.t), last.weights).mean()
+            losses["distortion"] = c.distortion_weight * loss
+        if c.hash_decay:
+            grids = (self.model[name].decay() for name in LEVELS)
+            losses["hash_decay"] = c.hash_decay * sum(grids)
+        return losses
+
+    def optimise(self, step: int) -> None:
+        c = self.config
+        self.optimiser.step(
+            warm_up_and_decay(
+                step, c.steps, first=c.lr, last=c.lr_final, warm_up=c.lr_warm_up, delay=c.lr_delay
+            )
+        )
+
+    @torch.no_grad()
+    def render(self, camera: Cameras, background: Tensor) -> Render:
+        c = self.config
+        hooks = self.hooks if c.vd.hull_at_inference else []
+        background = background.to(self.device)
+        radius = pixel_radius(camera)
+
+        def render_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            rays = self._bound(origins, directions, hooks)
+            return self._render_rays(rays, radius, background)
+
+        return render_image(camera.to(self.device), render_rays, self.frame, RAYS_AT_ONCE)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return self.optimiser.state_dict()
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.optimiser.load_state_dict(state)
+
+    def export(self, folder: Path) -> list[Path]:
+        mesh = mesh_density(self._density, self._colour, self.frame, half_side=1.0)
+        return export_mesh(Path(folder) / "mesh.ply", mesh)
+
+    def _bound(self, origins: Tensor, directions: Tensor, hooks: Sequence[SamplerHook]) -> LocalRays:
+        near = torch.full(origins.shape[:-1], self.config.near, device=origins.device)
+        far = torch.full_like(near, self.config.far)
+        return bound_rays(origins, directions, near, far, self.frame, hooks)
+
+    def _see(self, rays: LocalRays, radius, counts: Sequence[int], progress: float, draw):
+        """All levels along rays, and the field's colours (n, S, 3). Samples are jittered by the generator."""
+        level = None
+        levels = []
+        for name, count in zip(LEVELS, counts, strict=True):
+            level, out = self._look(name, rays, radius, level, count, progress, draw)
+            levels.append(level)
+        return levels, self._shade(out[..., 1:], rays.directions[:, None])
+
+    def _look(
+        self, name: str, rays: LocalRays, radius, before: Level | None, count: int, progress: float, draw
+    ):
+        """One level, sampled where the level before saw something, and its network's outputs (n, S, ...)."""
+        n = len(rays.near)
+        near, far = rays.near[:, None], rays.far[:, None]
+        if before is None:
+            s, weights = near.new_tensor([0.0, 1.0]).expand(n, 2).contiguous(), torch.ones_like(near)
+        else:
+            s, weights = before.s, before.weights.detach()
+        jitter = None if draw is None else torch.rand(n, 1, generator=draw).to(self.device)
+        s = sample_edges(s, anneal(weights, progress, self.config.anneal_slope), count, jitter)
+        t = distances_of(s, near, far)
+        turn = None if draw is None else torch.rand(n, count, generator=draw).to(self.device)
+        points, std = multisample(rays.origins, rays.directions, t, radius, turn)
+        out = self.model[name](points, std)
+        density = truncated_exp(out[..., 0] + self.config.density_bias)
+        return Level(s, t, weights_from_density(density, t)[0]), out
+
+    def _render_rays(self, rays: LocalRays, radius: Tensor, background: Tensor):
+        """Colour, opacity and depth of rays, level by level for those that still may show something."""
+        counts = self.config.test_samples or self.config.samples
+        n = len(rays.near)
+        rgb, alpha, depth = background.expand(n, 3).clone(), torch.zeros_like(rays.near), rays.far.clone()
+        left, level = rays.hit.nonzero()[:, 0], None
+        rays = LocalRays(*(x[left] for x in rays))
+        for name, count in zip(LEVELS, counts, strict=True):
+            if not len(left):
+                return rgb, alpha, depth
+            level, out = self._look(name, rays, radius, level, count, 1.0, None)
+            # Proposals bound the field's weights from above: where they see nothing, it does not either.
+            seen = (level.weights.sum(-1) > INVISIBLE).nonzero()[:, 0]
+            left, out, level = left[seen], out[seen], Level(*(x[seen] for x in level))
+            rays = LocalRays(*(x[seen] for x in rays))
+        if len(left):
+            colours = self._shade(out[..., 1:], rays.directions[:, None])
+            rgb[left], alpha[left], depth[left] = composite(level.weights, colours, level.t, background)
+        return rgb, alpha, depth
+
+    def _shade(self, bottleneck: Tensor, directions: Tensor) -> Tensor:
+        view = encode_sinusoids(directions, self.config.view_degree)
+        view = view.expand(*bottleneck.shape[:-1], view.shape[-1])
+        return self.model["colour"](torch.cat([bottleneck, view], -1))
+
+    def _field(self, points: Tensor) -> Tensor:
+        points = points.to(self.device)[:, None]
+        # As one voxel of the finest level would be seen.
+        std = torch.full_like(points[..., 0], 0.5 / self.config.grid.max_resolution)
+        return self.model["field"](points, std)
+
+    def _density(self, points: Tensor) -> Tensor:
+        return truncated_exp(self._field(points)[:, 0] + self.config.density_bias)
+
+    def _colour(self, points: Tensor, directions: Tensor) -> Tensor:
+        return self._shade(self._field(points)[:, 1:], directions.to(self.device))

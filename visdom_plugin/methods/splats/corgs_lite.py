@@ -1,0 +1,183 @@
+"""CoR-GS lite: two sets of Gaussians fitted to the same photographs, each a check on the other.
+
+Zhang et al. 2024: where two sets that differ only by the randomness of densification disagree, both are likely
+wrong. Co-regularisation draws their renders of unseen views together, co-pruning removes Gaussians that have no
+counterpart. Hooks, where there are any, give the initial points and add their losses to each set.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visdom_plugin.errors import SceneError
+from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.hooks.protocols import GaussianHook
+from visdom_plugin.losses import photometric_loss
+from visdom_plugin.methods.splats.configs import CorgsConfig
+from visdom_plugin.methods.splats.initial_points import draw_box, draw_points
+from visdom_plugin.methods.splats.pseudo_views import draw_between, draw_on_ellipse, fit_ellipse
+from visdom_plugin.render import Render
+from visdom_plugin.scene import Views
+from visdom_plugin.seeding import generator
+from visdom_plugin.splat.model import (
+    GaussianSet,
+    draw_background,
+    fit_view,
+    load_kernels,
+    scene_extent,
+)
+from visdom_plugin.splat.ply import write_ply
+from visdom_plugin.splat.rasterise import rasterise
+
+log = logging.getLogger(__name__)
+
+
+class CorgsLite:
+    """See `visdom_plugin.training.protocols.Method` for what each call does. Set 0 is shown and exported."""
+
+    def __init__(self, config: CorgsConfig):
+        self.config = config
+        self.total_steps = config.steps
+
+    def setup(
+        self, views: Views, hooks: Sequence[GaussianHook], *, hull, device: torch.device, seed: int
+    ) -> None:
+        c = self.config
+        if len(views) < 2:
+            raise SceneError(
+                f"corgs-lite compares its two sets between training cameras, and there is {len(views)}",
+                todo="give --views 2 or more",
+            )
+        self.device, self.seed, self.hooks = device, seed, list(hooks)
+        self.cameras, self.look_at = views.cameras, look_at_point(views.cameras)
+        self.ellipse = fit_ellipse(views.cameras)
+        load_kernels(device)
+        draw = generator(seed, "initial_points")
+        if c.initial_cloud == "random" and not self.hooks:
+            xyz, rgb = draw_box(views.cameras, c.initial_points, draw)
+        else:
+            xyz, rgb = draw_points(self.hooks, hull, views, c.initial_points, draw)
+        extent = scene_extent(views.cameras)
+        self.sets = [GaussianSet(c, xyz, rgb, extent=extent, device=device) for _ in range(2)]
+        self.co_prune_distance = c.co_prune_extents * extent if c.co_prune_world is None else c.co_prune_world
+
+    def train_step(self, batch, step: int) -> dict[str, Tensor]:
+        c, done = self.config, step + 1
+        degree = min(c.sh_degree, step // c.sh_every)
+        background = draw_background(c, generator(self.seed, "step", step), self.device)
+        sets = [one.gaussians() for one in self.sets]
+
+        def show(gaussians, camera: Cameras) -> Render:
+            return rasterise(gaussians, camera, background, sh_degree=degree)
+
+        self._renders, losses = [show(gaussians, batch.camera) for gaussians in sets], {}
+        for i, render in enumerate(self._renders):
+            found, psnr = fit_view(render, batch, background, c)
+            losses |= _numbered(found, i)
+            if i == 0:
+                self.metrics = {"psnr": psnr}
+        if c.pseudo_every and c.pseudo_from <= done <= c.pseudo_until and done % c.pseudo_every == 0:
+            camera = self.pseudo_camera(step)
+            seen = [show(gaussians, camera).rgb for gaussians in sets]
+            losses |= co_regularisation(*seen, c.ssim_weight, c.pseudo_weight)
+        for h, hook in enumerate(self.hooks):
+            for i, gaussians in enumerate(sets):
+                # The same numbers for both sets, so that the hook shows both the same views.
+                draw = generator(self.seed, "hook", h, step)
+                found = hook.loss(lambda camera, seen=gaussians: show(seen, camera), step, draw)
+                losses |= _numbered(found, i)
+        return losses
+
+    def pseudo_camera(self, step: int) -> Cameras:
+        """The unseen view of a step, the same for both sets."""
+        draw = generator(self.seed, "pseudo", step)
+        if self.config.pseudo_views == "ellipse":
+            return draw_on_ellipse(self.ellipse, draw)
+        return draw_between(self.cameras, self.look_at, draw)
+
+    @torch.no_grad()
+    def optimise(self, step: int) -> None:
+        c, done = self.config, step + 1
+        since_reset = done - c.opacity_reset_from
+        for i, (one, render) in enumerate(zip(self.sets, self._renders, strict=True)):
+            one.optimise(step, render)
+            if c.densify_from < done < c.densify_until and done % c.densify_every == 0:
+                one.densify(generator(self.seed, "split", i, done))
+            if c.opacity_reset_every and since_reset >= 0 and since_reset % c.opacity_reset_every == 0:
+                one.reset_opacity()
+        self._renders = None
+        if c.co_prune_every and done > c.densify_from and done % c.co_prune_every == 0:
+            self._co_prune(done)
+        for one in self.sets:
+            for hook in self.hooks:
+                one.remove(hook.after_step(one.gaussians(), step))
+
+    def _co_prune(self, done: int) -> None:
+        gone = unmatched(*(one.means for one in self.sets), self.co_prune_distance)
+        if bool(gone[0].all()):
+            log.warning(
+                "step %d: the two sets are nowhere closer than %.3g, none is pruned",
+                done,
+                self.co_prune_distance,
+            )
+        for one, lonely in zip(self.sets, gone, strict=True):
+            one.remove(lonely)
+
+    @torch.no_grad()
+    def render(self, camera: Cameras, background: Tensor) -> Render:
+        return rasterise(self.sets[0].gaussians(), camera, background.to(self.device))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {f"set{i}.{k}": v for i, one in enumerate(self.sets) for k, v in one.state_dict().items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        for i, one in enumerate(self.sets):
+            prefix = f"set{i}."
+            one.load_state_dict({k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)})
+
+    def export(self, folder: Path) -> list[Path]:
+        path = Path(folder) / "point_cloud.ply"
+        write_ply(path, self.sets[0].gaussians())
+        return [path]
+
+
+def co_regularisation(first: Tensor, second: Tensor, ssim_weight: float, weight: float) -> dict[str, Tensor]:
+    """The image loss of each set's render of an unseen view towards the other's, which stays where it is.
+
+    Args:
+        first, second: (H, W, 3) the two sets' renders on the same background.
+    """
+    pairs = ((first, second.detach()), (second, first.detach()))
+    return {f"co_{i}": weight * photometric_loss(a, b, ssim_weight) for i, (a, b) in enumerate(pairs)}
+
+
+def unmatched(first: Tensor, second: Tensor, distance: float) -> tuple[Tensor, Tensor]:
+    """Points of each set whose nearest neighbour in the other is farther away than `distance`.
+
+    Both are measured before either loses any. If all points of one have none, so do all of the other's.
+
+    Args:
+        first, second: (N, 3) and (M, 3), N and M at least 1.
+
+    Returns:
+        (N,) and (M,) bool, True for those without a counterpart, on the inputs' device.
+    """
+    from scipy.spatial import cKDTree
+
+    points = [x.detach().double().cpu().numpy() for x in (first, second)]
+    trees = [cKDTree(p) for p in points]
+    nearest = [trees[1 - i].query(points[i], workers=-1)[0] for i in range(2)]
+    return tuple(
+        torch.from_numpy(np.asarray(d > distance)).to(x.device)
+        for d, x in zip(nearest, (first, second), strict=True)
+    )
+
+
+def _numbered(losses: dict[str, Tensor], i: int) -> dict[str, Tensor]:
+    return {f"{name}_{i}": value for name, value in losses.items()}

@@ -1,0 +1,109 @@
+"""3DGS-GO: Gaussians that start in a hull and are fitted to a few masked photographs.
+
+The coarse stage of GaussianObject (Yang et al. 2024) on 3DGS (Kerbl et al. 2023), without the diffusion
+repair. Hooks, where there are any, give the initial points and add their losses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.hooks.protocols import GaussianHook
+from visdom_plugin.losses import disparity_loss
+from visdom_plugin.methods.splats.configs import GsGoConfig
+from visdom_plugin.methods.splats.initial_points import draw_points
+from visdom_plugin.render import Render
+from visdom_plugin.scene import Views
+from visdom_plugin.seeding import generator
+from visdom_plugin.splat.densify import stray_gaussians
+from visdom_plugin.splat.model import (
+    GaussianSet,
+    draw_background,
+    fit_view,
+    load_kernels,
+    scene_extent,
+)
+from visdom_plugin.splat.ply import write_ply
+from visdom_plugin.splat.rasterise import rasterise
+
+
+class GsGo:
+    """See `visdom_plugin.training.protocols.Method` for what each call does."""
+
+    def __init__(self, config: GsGoConfig):
+        self.config = config
+        self.total_steps = config.steps
+
+    def setup(
+        self, views: Views, hooks: Sequence[GaussianHook], *, hull, device: torch.device, seed: int
+    ) -> None:
+        self.device, self.seed, self.hooks = device, seed, list(hooks)
+        load_kernels(device)
+        draw = generator(seed, "initial_points")
+        xyz, rgb = draw_points(self.hooks, hull, views, self.config.initial_points, draw)
+        self.splats = GaussianSet(self.config, xyz, rgb, extent=scene_extent(views.cameras), device=device)
+
+    def train_step(self, batch, step: int) -> dict[str, Tensor]:
+        c = self.config
+        degree = min(c.sh_degree, step // c.sh_every)
+        gaussians = self.splats.gaussians()
+        background = draw_background(c, generator(self.seed, "step", step), self.device)
+        render = self._render = rasterise(gaussians, batch.camera, background, sh_degree=degree)
+        losses, psnr = fit_view(render, batch, background, c)
+        self.metrics = {"psnr": psnr}
+        if c.depth_weight and batch.mono_depth is not None and batch.mask_known:
+            object_mask = batch.mask if batch.weight is None else batch.mask * batch.weight
+            depth = disparity_loss(render.depth, render.alpha, batch.mono_depth, object_mask)
+            if depth is not None:
+                losses["depth"] = c.depth_weight * depth
+        for i, hook in enumerate(self.hooks):
+            losses |= hook.loss(
+                lambda camera: rasterise(gaussians, camera, background, sh_degree=degree),
+                step,
+                generator(self.seed, "hook", i, step),
+            )
+        return losses
+
+    @torch.no_grad()
+    def optimise(self, step: int) -> None:
+        c, done = self.config, step + 1
+        self.splats.optimise(step, self._render)
+        self._render = None
+        if done < c.densify_until:
+            if done > c.densify_from and done % c.densify_every == 0:
+                large = (c.prune_radius_px, c.prune_scale) if done > c.prune_large_from else None
+                self.splats.densify(generator(self.seed, "split", done), large)
+            if c.floater_every and done % c.floater_every == 0:
+                self._remove_strays(done)
+            if c.opacity_reset_every and done % c.opacity_reset_every == 0:
+                self.splats.reset_opacity()
+        for hook in self.hooks:
+            self.splats.remove(hook.after_step(self.splats.gaussians(), step))
+
+    @torch.no_grad()
+    def render(self, camera: Cameras, background: Tensor) -> Render:
+        return rasterise(self.splats.gaussians(), camera, background.to(self.device))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return self.splats.state_dict()
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.splats.load_state_dict(state)
+
+    def export(self, folder: Path) -> list[Path]:
+        path = Path(folder) / "point_cloud.ply"
+        write_ply(path, self.splats.gaussians())
+        return [path]
+
+    def _remove_strays(self, done: int) -> None:
+        c = self.config
+        if len(self.splats) < 16:
+            return
+        t = (done - c.floater_every) / max(c.densify_until - c.floater_every, 1)
+        sigmas = c.floater_sigmas[0] + t * (c.floater_sigmas[1] - c.floater_sigmas[0])
+        self.splats.remove(stray_gaussians(self.splats.means, sigmas))

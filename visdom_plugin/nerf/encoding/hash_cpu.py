@@ -1,0 +1,76 @@
+"""The hash encoding on the CPU: numba kernels as a differentiable function of the table.
+
+Results repeat to the bit, whatever the number of threads: forward, an item is a level of a block of points;
+backward, an item is a whole level, whose rows are added to in the order of the points.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from visdom_plugin.compute.parallel import spread
+from visdom_plugin.nerf.encoding import hash_kernels
+from visdom_plugin.nerf.encoding.hash_layout import HashLayout
+
+PIECES_PER_LEVEL = 4
+"""Launching a piece costs some 10 us; below this many, two threads wait for one another at the end."""
+
+
+def encode_cpu(points: Tensor, scales: Tensor | None, table: Tensor, layout: HashLayout):
+    """(groups, S, 3), (groups, S) or None -> (groups, levels * features), (groups, levels) or an empty tensor."""
+    return _Encode.apply(table, points, scales, layout)
+
+
+@cache
+def _describe(layout: HashLayout) -> tuple[np.ndarray, ...]:
+    """Resolutions, whether dense, masks of the hash, first rows (and their number): what the kernels read."""
+    masks = [0 if dense else size - 1 for dense, size in zip(layout.dense, layout.sizes, strict=True)]
+    return (
+        np.array(layout.resolutions, np.int64),
+        np.array(layout.dense),
+        np.array(masks, np.int64),
+        np.array(layout.offsets, np.int64),
+    )
+
+
+def _flat(tensor: Tensor | None) -> np.ndarray:
+    if tensor is None:
+        return np.empty(0, np.float32)
+    return tensor.detach().contiguous().numpy().reshape(-1)
+
+
+class _Encode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, table, points, scales, layout):
+        groups, samples = points.shape[:-1]
+        ctx.layout, ctx.samples = layout, samples
+        ctx.save_for_backward(points, scales)
+        out = torch.empty(groups, layout.width)
+        mean_strengths = torch.empty(groups if scales is not None else 0, layout.levels)
+        if samples > hash_kernels.BLOCK:
+            raise ValueError(f"groups of {samples} points; the CPU kernels take {hash_kernels.BLOCK} at most")
+        blocks = -(-groups // (hash_kernels.BLOCK // samples))
+        spread(
+            hash_kernels.encode, layout.levels * blocks, max(blocks // PIECES_PER_LEVEL, 1), samples,
+            _flat(points), _flat(scales), _flat(table), layout.features, *_describe(layout),
+            _flat(out), _flat(mean_strengths),
+        )  # fmt: skip
+        ctx.mark_non_differentiable(mean_strengths)
+        return out, mean_strengths
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, g_out, _):
+        points, scales = ctx.saved_tensors
+        layout, samples = ctx.layout, ctx.samples
+        g_table = torch.empty(layout.rows, layout.features)
+        spread(
+            hash_kernels.encode_backward, layout.levels, 1, samples, _flat(points), _flat(scales),
+            _flat(g_out), layout.features, *_describe(layout), _flat(g_table),
+        )  # fmt: skip
+        return g_table, None, None, None

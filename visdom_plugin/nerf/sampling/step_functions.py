@@ -1,0 +1,161 @@
+"""Step functions on a ray: S intervals between sorted edges t (..., S + 1), each with a weight (..., S), which is
+the mass in the interval (mass per length is called density). Nothing here carries a gradient.
+
+The maths of mip-NeRF 360 (resampling, dilation, annealing) and Zip-NeRF (blurring).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from visdom_plugin.nerf.sampling import step_kernels
+from visdom_plugin.nerf.sampling.step_kernels import LEAST_WEIGHT
+
+
+@torch.no_grad()
+def sample_edges(edges: Tensor, weights: Tensor, count: int, jitter: Tensor | None = None) -> Tensor:
+    """Edges of `count` new intervals, dense where the weights are.
+
+    As in mip-NeRF 360: `count` points that split the mass evenly become the intervals' middles, so to say; the
+    new edges lie half way between neighbouring points, and the two outermost mirror their neighbours, inside
+    the old edges.
+
+    Args:
+        edges: (..., S + 1) ascending.
+        weights: (..., S) >= 0, of any sum.
+        count: at least 2.
+        jitter: (..., count) or (..., 1) in [0, 1), uniform: one number per point, or one that moves all points of
+            a ray together. None: 0.5.
+
+    Returns:
+        (..., count + 1) ascending, within the old edges.
+    """
+    if count < 2:
+        raise ValueError(f"sample_edges makes at least 2 intervals, not {count}")
+    if jitter is None:
+        jitter = edges.new_full((1,), 0.5)
+    if edges.device.type == "cpu":
+        return step_kernels.run(step_kernels.sample, count + 1, (edges, weights, jitter))
+    return _sample_torch(edges, weights, count, jitter)
+
+
+def _sample_torch(edges: Tensor, weights: Tensor, count: int, jitter: Tensor) -> Tensor:
+    edges = edges.expand(*weights.shape[:-1], -1)
+    mass = weights.clamp_min(LEAST_WEIGHT).cumsum(-1)
+    mass = torch.nn.functional.pad(mass / mass[..., -1:], (1, 0))
+    steps = torch.arange(count, dtype=mass.dtype, device=mass.device)
+    u = ((steps + jitter) / count).expand(*mass.shape[:-1], count).contiguous()
+    points = _interpolate(mass, edges, u)
+    middles = 0.5 * (points[..., 1:] + points[..., :-1])
+    first = (2 * points[..., :1] - middles[..., :1]).maximum(edges[..., :1])
+    last = (2 * points[..., -1:] - middles[..., -1:]).minimum(edges[..., -1:])
+    return torch.cat([first, middles, last], -1)
+
+
+def _interpolate(x: Tensor, y: Tensor, at: Tensor) -> Tensor:
+    """The piecewise linear function through (x, y) (..., S + 1) at points (..., N); constant outside."""
+    below = (torch.searchsorted(x, at, right=True) - 1).clamp(0, x.shape[-1] - 2)
+    x0, x1 = x.gather(-1, below), x.gather(-1, below + 1)
+    share = ((at - x0) / (x1 - x0).clamp_min(torch.finfo(x.dtype).tiny)).clamp(0, 1)
+    return torch.lerp(y.gather(-1, below), y.gather(-1, below + 1), share)
+
+
+@torch.no_grad()
+def query(edges: Tensor, values: Tensor, at: Tensor) -> Tensor:
+    """Values (..., N) at points (..., N) of the function that is values (..., S) between edges, else 0.
+
+    An interval owns its lower edge.
+    """
+    index = torch.searchsorted(edges.contiguous(), at.contiguous(), right=True) - 1
+    found = values.gather(-1, index.clamp(0, values.shape[-1] - 1))
+    return torch.where((index >= 0) & (index < values.shape[-1]), found, 0)
+
+
+@torch.no_grad()
+def anneal(weights: Tensor, progress: float, slope: float = 10.0) -> Tensor:
+    """weights^b with b from 0 to 1 as progress does (Schlick's bias; mip-NeRF 360, eq. 18): flat at the start."""
+    return weights ** (slope * progress / ((slope - 1) * progress + 1))
+
+
+@torch.no_grad()
+def dilate(edges: Tensor, weights: Tensor, distance: float, low: float = 0.0, high: float = 1.0):
+    """The greatest density within `distance` of each point, normalised to the old mass (mip-NeRF 360, supplement).
+
+    Args:
+        edges: (..., S + 1). weights: (..., S).
+        distance: in the unit of the edges.
+        low, high: the domain, to which the new edges are clipped.
+
+    Returns:
+        edges (..., 3 S + 1) and weights (..., 3 S).
+    """
+    wide = torch.cat([edges, edges[..., :-1] - distance, edges[..., 1:] + distance], -1)
+    wide = wide.sort(-1).values.clamp(low, high)
+    if edges.device.type == "cpu":
+        arrays = (edges, weights, wide)
+        return wide, step_kernels.run(step_kernels.dilate, wide.shape[-1] - 1, arrays, distance)
+    return wide, _dilate_torch(edges, weights, distance, wide)
+
+
+def _dilate_torch(edges: Tensor, weights: Tensor, distance: float, wide: Tensor) -> Tensor:
+    tiny = torch.finfo(edges.dtype).tiny
+    width = edges.diff(dim=-1)
+    density = torch.where(width > 0, weights / width.clamp_min(tiny), 0)
+    lower, upper = edges[..., :-1] - distance, edges[..., 1:] + distance
+    middles = 0.5 * (wide[..., 1:] + wide[..., :-1])[..., None]
+    covered = (lower[..., None, :] <= middles) & (middles < upper[..., None, :])
+    new = torch.where(covered, density[..., None, :], 0).amax(-1) * wide.diff(dim=-1)
+    return new * (weights.sum(-1, keepdim=True) / new.sum(-1, keepdim=True).clamp_min(tiny))
+
+
+@torch.no_grad()
+def blur(edges: Tensor, weights: Tensor, half_width: float) -> tuple[Tensor, Tensor]:
+    """The density averaged over a window of `half_width` to either side: piecewise linear (Zip-NeRF, section 3).
+
+    Returns:
+        Knots (..., 2 S + 2), ascending, and the density (..., 2 S + 2) there. It integrates to the weights' sum.
+    """
+    edges, weights = edges.double(), weights.double()
+    knots = torch.cat([edges - half_width, edges + half_width], -1).sort(-1).values
+    mass = torch.nn.functional.pad(weights.cumsum(-1), (1, 0))
+    above, below = (_interpolate(edges, mass, knots + side) for side in (half_width, -half_width))
+    return knots, (above - below) / (2 * half_width)
+
+
+@torch.no_grad()
+def resample_blurred(edges: Tensor, weights: Tensor, half_width: float, at: Tensor) -> Tensor:
+    """Mass of the blurred function between neighbouring points.
+
+    The blurred function's running mass at x is the mean of the sharp one's over [x - half_width, x + half_width],
+    which is a difference of the latter's integral: piecewise quadratic, and exact without sorting any knots.
+    In float64, since the difference cancels.
+
+    Args:
+        edges: (..., S + 1). weights: (..., S).
+        half_width: > 0, in the unit of the edges.
+        at: (..., N + 1) ascending points.
+
+    Returns:
+        (..., N).
+    """
+    if edges.device.type == "cpu":
+        arrays = (edges, weights, at)
+        return step_kernels.run(step_kernels.resample_blurred, at.shape[-1] - 1, arrays, half_width)
+    return _resample_blurred_torch(edges, weights, half_width, at).to(weights)
+
+
+def _resample_blurred_torch(edges: Tensor, weights: Tensor, half_width: float, at: Tensor) -> Tensor:
+    edges, weights, at = edges.double(), weights.double(), at.double()
+    width = edges.diff(dim=-1)
+    mass = torch.nn.functional.pad(weights.cumsum(-1), (1, 0))
+    integral = torch.nn.functional.pad((width * (mass[..., :-1] + 0.5 * weights)).cumsum(-1), (1, 0))
+    x = torch.cat([at - half_width, at + half_width], -1)
+    inside = x.maximum(edges[..., :1]).minimum(edges[..., -1:])
+    index = (torch.searchsorted(edges, inside, right=True) - 1).clamp_max(weights.shape[-1] - 1)
+    offset = inside - edges.gather(-1, index)
+    density = weights / width.clamp_min(torch.finfo(width.dtype).tiny)
+    start = mass.gather(-1, index) + 0.5 * offset * density.gather(-1, index)
+    total = integral.gather(-1, index) + offset * start + mass[..., -1:] * (x - inside).clamp_min(0)
+    below, above = total.chunk(2, -1)
+    return (above - below).diff(dim=-1) / (2 * half_width)

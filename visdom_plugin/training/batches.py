@@ -1,0 +1,140 @@
+"""What training draws from the views: one view per step for splatting, random pixels for radiance fields."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from visdom_plugin.errors import SceneError
+from visdom_plugin.geometry.cameras import Cameras, pixel_radius, rays_of
+from visdom_plugin.scene import Views
+from visdom_plugin.seeding import generator
+
+
+class ViewBatch(NamedTuple):
+    """One whole training view."""
+
+    index: int
+    camera: Cameras
+    """One camera, shape ()."""
+    image: Tensor
+    """(H, W, 3) float32 in [0, 1], background as photographed."""
+    mask: Tensor
+    """(H, W) float32, 1 on the object."""
+    mono_depth: Tensor | None
+    """(H, W) float32 in its own unit."""
+    weight: Tensor | None = None
+    """(H, W) float32, 0 at pixels that take part in no loss, else 1; None when all of them do."""
+    mask_known: bool = True
+    """False for a view that is good for colour only: its mask says nothing."""
+
+
+class PixelBatch(NamedTuple):
+    """Pixels drawn evenly over all training views, ignored ones left out."""
+
+    origins: Tensor
+    """(n, 3) float32 world frame."""
+    directions: Tensor
+    """(n, 3) float32 unit, through the pixels' centres."""
+    rgb: Tensor
+    """(n, 3) float32 in [0, 1]."""
+    mask: Tensor
+    """(n,) float32, 1 on the object."""
+    radii: Tensor
+    """(n,) float32 radius of each pixel's cone at distance 1."""
+    mask_known: Tensor | None = None
+    """(n,) bool, False at pixels of views that are good for colour only; None when all masks are known."""
+
+
+class DataManager:
+    """Batches as pure functions of (seed, step), so that a resumed run draws what the first would have drawn.
+
+    Pixels stay uint8 in memory; float copies are made per batch.
+
+    Args:
+        views: the training views.
+        seed: the run's seed.
+        device: where batches come out.
+    """
+
+    def __init__(self, views: Views, seed: int, device: torch.device | str = "cpu"):
+        self.seed, self.device = seed, torch.device(device)
+        self._cameras = views.cameras.to(self.device)
+        self._images = [image.to(self.device) for image in views.images]
+        self._masks = [mask.to(self.device) for mask in views.masks]
+        self._depths = [None if d is None else d.to(self.device) for d in views.mono_depths]
+        ignored = [views.ignored(i) for i in range(len(views))]
+        self._counted = [None if g is None or not bool(g.any()) else (~g).to(self.device) for g in ignored]
+        self._mask_known = [views.mask_origin(i) not in ("colour", "missing") for i in range(len(views))]
+        self._ends = torch.tensor([mask.numel() for mask in self._masks]).cumsum(0)
+        self._drawable: Tensor | None = None
+        self._flat: tuple[Tensor, Tensor] | None = None
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def view_index(self, step: int) -> int:
+        """The view of a step: every pass over the views is a permutation of its own."""
+        epoch, position = divmod(step, len(self))
+        order = torch.randperm(len(self), generator=generator(self.seed, "views", epoch))
+        return int(order[position])
+
+    def view_batch(self, step: int) -> ViewBatch:
+        """The whole view of a step."""
+        return self.view(self.view_index(step))
+
+    def view(self, index: int) -> ViewBatch:
+        """A whole view by its index."""
+        return ViewBatch(
+            index,
+            self._cameras[index],
+            self._images[index].float() / 255,
+            self._masks[index].float(),
+            self._depths[index] if self._depths else None,
+            None if self._counted[index] is None else self._counted[index].float(),
+            self._mask_known[index],
+        )
+
+    def pixel_batch(self, step: int, n: int) -> PixelBatch:
+        """`n` pixels drawn with replacement, every pixel of every view alike but for ignored ones.
+
+        Raises:
+            SceneError: when all pixels are ignored.
+        """
+        if self._flat is None:
+            self._flatten()
+        draw = generator(self.seed, "pixels", step)
+        if self._drawable is None:
+            flat = torch.randint(int(self._ends[-1]), (n,), generator=draw)
+        else:
+            flat = self._drawable[torch.randint(len(self._drawable), (n,), generator=draw)]
+        view = torch.searchsorted(self._ends, flat, right=True)
+        inside = (flat - torch.cat([self._ends.new_zeros(1), self._ends])[view]).to(self.device)
+        flat, view = flat.to(self.device), view.to(self.device)
+        cameras = self._cameras[view]
+        uv = torch.stack([inside % cameras.width, inside // cameras.width], -1)
+        rays = rays_of(cameras, (uv + 0.5).to(cameras.intrinsics)[:, None])
+        return PixelBatch(
+            rays.origins[:, 0].float(),
+            rays.directions[:, 0].float(),
+            self._flat[0][flat].float() / 255,
+            self._flat[1][flat].float(),
+            pixel_radius(cameras),
+            None if all(self._mask_known) else torch.tensor(self._mask_known, device=self.device)[view],
+        )
+
+    def _flatten(self) -> None:
+        rgb = torch.cat([image.reshape(-1, 3) for image in self._images])
+        self._flat = rgb, torch.cat([mask.reshape(-1) for mask in self._masks])
+        if any(c is not None for c in self._counted):
+            pairs = zip(self._counted, self._masks, strict=True)
+            counted = [torch.ones_like(m, dtype=torch.bool) if c is None else c for c, m in pairs]
+            self._drawable = torch.cat([c.reshape(-1) for c in counted]).nonzero()[:, 0].cpu()
+            if len(self._drawable) == 0:
+                raise SceneError(
+                    "every pixel of every training view is ignored",
+                    cause="ignore files that are inverted: white is what must be ignored",
+                    todo="invert them, or take the folder ignore away",
+                )
