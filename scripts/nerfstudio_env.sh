@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # A virtual environment with nerfstudio 1.1.5, a torch for the CPU, and this project, for the tests of the adapter:
-#   scripts/nerfstudio_env.sh DIR && DIR/bin/python -m pytest tests/hosts
+#   scripts/nerfstudio_env.sh DIR && DIR/bin/python -m pytest tests/integrations
 # It works offline once installed. Two things are for such machines only and have no place in the library:
 # torchvision over a CPU torch of another build lacks its operators, which nothing here calls, and fails at import
 # over nms; and LPIPS starts from weights that nerfstudio would download, which here are random, so that LPIPS means

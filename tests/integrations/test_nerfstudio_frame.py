@@ -126,7 +126,7 @@ def test_nerfstudio_is_imported_in_its_room_alone():
     sources = [
         p for name in ("visdom_plugin", "datamodules", "method_configs") for p in (root / name).rglob("*.py")
     ]
-    room = root / "visdom_plugin/hosts/nerfstudio"
-    imports = re.compile(r"^\s*(import|from) (nerfstudio|visdom_plugin\.hosts\.nerfstudio)\b", re.M)
+    room = root / "visdom_plugin/integrations/nerfstudio"
+    imports = re.compile(r"^\s*(import|from) (nerfstudio|visdom_plugin\.integrations\.nerfstudio)\b", re.M)
     assert [p for p in sources if room not in p.parents and imports.search(p.read_text("utf-8"))] == []
     assert any(imports.search(p.read_text("utf-8")) for p in room.glob("*.py"))

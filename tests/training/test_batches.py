@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import project
 from visdom_plugin.scene import Views
@@ -12,9 +13,9 @@ from visdom_plugin.training.batches import DataManager
 
 
 @pytest.fixture(scope="module")
-def views(tiny):
-    """Four views, the last of another size."""
-    v = tiny.train
+def views():
+    """Four views of 48 x 36 of the built-in scene, the last of another size."""
+    v = make_scene(SyntheticConfig(size=(48, 36), test_views=3)).train
     width = torch.tensor([48, 48, 48, 30])
     height = torch.tensor([36, 36, 36, 20])
     cameras = v.cameras.resized(width, height)

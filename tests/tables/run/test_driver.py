@@ -151,7 +151,7 @@ def test_a_run_that_is_held_at_the_last_moment_is_not_a_failure(tmp_path, monkey
     lock = (held / "run.lock").open("a+")
     fcntl.flock(lock, fcntl.LOCK_EX)
     threading.Timer(0.6, lock.close).start()
-    monkeypatch.setattr(driver.state, "is_held", lambda run_dir: False)
+    monkeypatch.setattr(driver.job_files, "is_held", lambda run_dir: False)
     assert _statuses(run_plan(made, Local(1, threads=1), write(tmp_path))) == ["finished"] * 2
 
 
