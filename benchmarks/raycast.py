@@ -13,7 +13,7 @@ from hull import capture, least
 
 from visdom_plugin.geometry.cameras import rays_of
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.hull.queries.raycast import build_bricks, cast, depth_and_silhouette, march
+from visdom_plugin.hull.queries.raycast import build_bricks, cast, cast_with_torch, depth_and_silhouette
 
 
 def main() -> None:
@@ -47,8 +47,8 @@ def main() -> None:
         seconds = least(lambda o=origins, d=directions: cast(hull, o, d), 5)
         print(f"{name:36s} {len(directions) / seconds / 1e6:6.2f} M rays/s, {hits:.0%} hit")
     origins, directions = (x[:100_000] for x in batches["random pixels of all views"])
-    seconds = least(lambda: march(hull, origins, directions), 2)
-    walked, marched = cast(hull, origins, directions), march(hull, origins, directions)
+    seconds = least(lambda: cast_with_torch(hull, origins, directions), 2)
+    walked, marched = cast(hull, origins, directions), cast_with_torch(hull, origins, directions)
     off = (walked.t_first - marched.t_first).abs().max() / hull.voxel_size
     print(
         f"{'torch marching on the CPU':36s} {0.1 / seconds:6.2f} M rays/s, at most {float(off):.1e} voxels off"

@@ -15,6 +15,7 @@ PAGE = ROOT / "docs" / "api.md"
 MODULES = {
     "visdom_plugin/geometry/cameras.py": "Cameras and rays",
     "visdom_plugin/hull/domain.py": "Carving",
+    "visdom_plugin/hull/settings.py": "Settings of a hull",
     "visdom_plugin/hull/hull.py": "The hull",
     "visdom_plugin/hooks/sampler.py": "Radiance fields",
     "visdom_plugin/hooks/regularizer.py": "Gaussians",

@@ -1,22 +1,26 @@
-"""VisibleDomain: how a hull is carved. Free of heavy imports, so that command lines can show it at once."""
+"""The visible domain of a capture, from its settings to the carved hull."""
 
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.hull.settings import HullSettings
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from visdom_plugin.geometry.cameras import Cameras
+    from visdom_plugin.hull.hull import Hull
 
 log = logging.getLogger(__name__)
 
-Box = tuple[tuple[float, float, float], tuple[float, float, float]]
-
 
 @dataclass(frozen=True)
-class VisibleDomain:
+class VisibleDomain(HullSettings):
     """Space that enough views see and whose views agree that it may be object.
 
     A voxel stays when it is inside the mask of at least `agreement` of the views that see its centre, and at
@@ -34,66 +38,7 @@ class VisibleDomain:
     ball is centred on the visible domain's box and reaches its corners, and the cube holds the ball.
     """
 
-    k: int | Literal["n-1", "auto"] = 3
-    """K, the fewest views that must see a voxel. "n-1": all but one. "auto": the largest of 3, 2, 1 whose hull
-    still covers the masks."""
-    agreement: float = 0.95
-    """Share of the views that see a voxel that must have it inside their mask, in (0, 1]."""
-    max_misses: int | None = None
-    """Views that may miss, in place of the agreement."""
-    kind: Literal["visdom", "traditional", "unit-sphere", "released-go"] = "visdom"
-    """Which hull of the paper's comparison."""
-    bounds: Box | None = None
-    """Lower and upper corner of the grid in world units, in place of automatic bounds."""
-    resolution: int = 256
-    """Voxels along the grid's longest side."""
-    components: Literal["explain", "drop-small", "all", "largest"] = "explain"
-    """Which connected pieces (26 neighbours) stay. "explain": those that cover foreground which no better piece
-    covers, so that thin parts that broke off stay and pieces in front of or behind the object go, whatever their
-    size. "drop-small": those not small beside the largest. "all". "largest". Where one view is enough
-    ("traditional", "unit-sphere", k = 1) "explain" finds the bounds, but of the grid's pieces only small ones are
-    dropped: what single views leave is what tells these kinds from the others."""
-    min_component_fraction: float = 0.05
-    """Pieces below this fraction of the largest piece's volume are small."""
-    dilate_px: int = 0
-    """Grow the masks by a square of 2 r + 1 pixels first."""
-    sphere_centre: tuple[float, float, float] | None = None
-    """Centre of the ball of "unit-sphere", world units."""
-    sphere_radius: float | None = None
-    """Radius of the ball of "unit-sphere", world units."""
-
-    def __post_init__(self):
-        def refuse(what: str, todo: str):
-            raise ConfigError(what, where="VisibleDomain", todo=todo)
-
-        if isinstance(self.k, bool) or not (
-            self.k in ("n-1", "auto") or (isinstance(self.k, int) and self.k >= 1)
-        ):
-            refuse(f"k is {self.k!r}", 'use a whole number from 1, "n-1" or "auto"')
-        if not 0 < self.agreement <= 1:
-            refuse(f"agreement is {self.agreement}", "use a share in (0, 1], such as 0.95")
-        if self.max_misses is not None and self.max_misses < 0:
-            refuse(f"max_misses is {self.max_misses}", "use 0, 1, 2, ... or None")
-        kinds = ("visdom", "traditional", "unit-sphere", "released-go")
-        if self.kind not in kinds:
-            refuse(f"kind is {self.kind!r}", f"use one of {', '.join(kinds)}")
-        if self.components not in ("explain", "drop-small", "all", "largest"):
-            refuse(f"components is {self.components!r}", "use explain, drop-small, all or largest")
-        if not 0 <= self.min_component_fraction <= 1:
-            refuse(f"min_component_fraction is {self.min_component_fraction}", "use a share in [0, 1]")
-        if not 8 <= self.resolution <= 2048:
-            refuse(f"resolution is {self.resolution}", "use 8 to 2048 voxels per side")
-        if not 0 <= self.dilate_px <= 1000:
-            refuse(f"dilate_px is {self.dilate_px}", "use 0 or more pixels")
-        if self.sphere_radius is not None and not 0 < self.sphere_radius < math.inf:
-            refuse(f"sphere_radius is {self.sphere_radius}", "use a positive length in world units")
-        if self.bounds is not None:
-            corners = [list(corner) for corner in self.bounds]
-            shaped = len(corners) == 2 and all(len(c) == 3 for c in corners)
-            if not shaped or not all(-math.inf < a < b < math.inf for a, b in zip(*corners, strict=True)):
-                refuse(f"bounds are {self.bounds}", "use two corners (x, y, z), each lower below its upper")
-
-    def carve(self, cameras, masks: Sequence) -> Hull:  # noqa: F821
+    def carve(self, cameras: Cameras, masks: Sequence[Tensor | np.ndarray] | Tensor | np.ndarray) -> Hull:
         """Carves the hull.
 
         Masks on a CUDA device are voted there voxel by voxel; all others are carved block by block on the CPU,
@@ -111,6 +56,44 @@ class VisibleDomain:
             SceneError: when masks and cameras do not fit each other: in number or size, or, with automatic bounds,
                 because the hull covers little of the masks and would cover them with poses of another convention.
         """
-        from visdom_plugin.hull.carving.carve import carve
+        # Settings stand on every command line: torch, numba and OpenCV are loaded when a hull is carved.
+        from visdom_plugin.hull.carving.carve import carve_silhouettes
+        from visdom_plugin.hull.carving.votes import gather_silhouettes
+        from visdom_plugin.hull.checks.coverage import choose_k, look_inverted
+        from visdom_plugin.hull.checks.explain_failure import explain_empty
+        from visdom_plugin.hull.checks.misfit import find_misfit
 
-        return carve(self, cameras, masks)
+        log.info("carving the hull (the first time on a machine its kernels are compiled: 10 to 30 s)")
+        silhouettes = gather_silhouettes(cameras, masks, self.dilate_px)
+        settings = self
+        if self.k == "auto" and self.kind != "released-go":
+            settings = replace(self, k=choose_k(cameras, silhouettes))
+        hull = carve_silhouettes(settings, cameras, silhouettes, device=getattr(masks[0], "device", "cpu"))
+        if hull is None:
+            raise explain_empty(settings, cameras, silhouettes)
+        hull = replace(hull, summary=hull.summary | {"k_asked": self.k})
+        misfit = find_misfit(settings, cameras, silhouettes, hull)
+        if misfit is not None:
+            log.warning(misfit)
+        elif not hull.summary["bounds_closed"]:
+            log.warning(
+                "the views leave the hull open: it is cut off at %s .. %s; more views from other sides, a "
+                "larger k or explicit bounds would close it",
+                *hull.bounds.round(4).tolist(),
+            )
+        inverted = [i for i in range(len(silhouettes)) if look_inverted(silhouettes.mask(i))]
+        if 2 * len(inverted) > len(silhouettes):
+            log.warning(
+                "%d of %d masks are foreground along most of the image's border: they may mark the background; "
+                "`visdom-hull --diagnose` tells more",
+                len(inverted),
+                len(silhouettes),
+            )
+        made, dropped = hull.summary, hull.summary["components_dropped"]
+        log.info(
+            "hull: %s, %d views; %s; %d of %s voxels of %.4g, %d of %d pieces%s, %.2f s",
+            self.kind, len(silhouettes), made["agreement_means"], hull.voxels, "x".join(map(str, hull.shape)),
+            hull.voxel_size, made["components"], made["components_found"], dropped and f" ({dropped})",
+            made["seconds"] + made["bounds_seconds"],
+        )  # fmt: skip
+        return hull

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -16,6 +14,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
+from visdom_plugin.atomic_files import appearing, write_bytes
 from visdom_plugin.errors import CheckpointError
 from visdom_plugin.hull.foreign import check_bounds, check_grid
 from visdom_plugin.hull.grid.mesh import mesh_grid
@@ -41,6 +40,7 @@ class Hull:
 
     def __post_init__(self):
         object.__setattr__(self, "bounds", np.array(self.bounds, np.float64))
+        object.__setattr__(self, "summary", dict(self.summary))
         _freeze(self.occupancy, self.bounds)
 
     @classmethod
@@ -248,7 +248,8 @@ class Hull:
             "summary": self.summary,
         }
         text = np.frombuffer(json.dumps(header).encode(), np.uint8)
-        write_whole(path, lambda file: np.savez_compressed(file, header=text, occupancy=packed))
+        with appearing(Path(path)) as part, part.open("wb") as file:
+            np.savez_compressed(file, header=text, occupancy=packed)
 
     @classmethod
     def load(cls, path: str | Path) -> Hull:
@@ -306,33 +307,13 @@ class Hull:
             f"element vertex {len(vertices)}\n" + "".join(f"property float {a}\n" for a in "xyz")
             + f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
         )  # fmt: skip
-        write_whole(
-            path, lambda f: f.write(header.encode() + vertices.astype("<f4").tobytes() + records.tobytes())
-        )
+        write_bytes(Path(path), header.encode() + vertices.astype("<f4").tobytes() + records.tobytes())
 
 
 def _freeze(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
     for array in arrays:
         array.flags.writeable = False
     return arrays
-
-
-def write_whole(path: str | Path, write: Callable[[Any], Any]) -> None:
-    """Lets `write` fill a temporary file beside `path`, then renames it, so that readers never see a part."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            write(file)
-        # mkstemp makes files private; a result is as readable as any other file.
-        umask = os.umask(0)
-        os.umask(umask)
-        Path(name).chmod(0o666 & ~umask)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def occupied_box(occupancy: np.ndarray) -> np.ndarray:

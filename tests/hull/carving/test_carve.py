@@ -10,7 +10,7 @@ import torch
 
 from tests.hull.balls import ball_masks, box_masks, moved, ring
 from visdom_plugin.errors import ConfigError, EmptyHullError
-from visdom_plugin.hull.carving.carve import keep_rule
+from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Grid, dense_carve, gather_silhouettes
 from visdom_plugin.hull.domain import VisibleDomain
 
@@ -34,7 +34,7 @@ def test_carve_is_the_dense_vote(kind):
     masks = ball_masks(cameras, BALLS)
     domain = VisibleDomain(kind=kind, resolution=50, components="all")
     hull = domain.carve(cameras, masks)
-    wanted = dense_carve(gather_silhouettes(cameras, masks), grid_of(hull), keep_rule(domain, 5)).numpy()
+    wanted = dense_carve(gather_silhouettes(cameras, masks), grid_of(hull), KeepRule.of(domain, 5)).numpy()
     if kind == "unit-sphere":
         centres = np.stack(np.meshgrid(*(grid_of(hull).centres(a) for a in range(3)), indexing="ij"), -1)
         wanted &= (

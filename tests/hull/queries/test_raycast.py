@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from tests.hull.balls import ring
 from visdom_plugin.hull.hull import Hull
-from visdom_plugin.hull.queries.raycast import build_bricks, cast, depth_and_silhouette, march
+from visdom_plugin.hull.queries.raycast import build_bricks, cast, cast_with_torch, depth_and_silhouette
 
 
 def slow_cast(hull: Hull, origins, directions):
@@ -80,7 +80,7 @@ def test_torch_march_equals_numba_walk(seed, fill):
     random = np.random.default_rng(seed)
     hull = random_hull(random, fill)
     origins, directions = (torch.from_numpy(x) for x in random_rays(random, hull, 200))
-    walked, marched = cast(hull, origins, directions), march(hull, origins, directions)
+    walked, marched = cast(hull, origins, directions), cast_with_torch(hull, origins, directions)
     half_voxel = 0.5 * hull.voxel_size / directions.norm(dim=-1)
     assert (walked.hit != marched.hit).sum() <= 1
     same = walked.hit & marched.hit
@@ -147,7 +147,10 @@ def test_rays_without_direction_and_nan_miss():
 def test_an_empty_hull_is_never_met():
     hull = Hull(np.zeros((5, 6, 7), bool), np.array([[-1.0] * 3, [1.0] * 3]))
     origins, directions = torch.randn(50, 3), torch.randn(50, 3)
-    assert not cast(hull, origins, directions).hit.any() and not march(hull, origins, directions).hit.any()
+    assert (
+        not cast(hull, origins, directions).hit.any()
+        and not cast_with_torch(hull, origins, directions).hit.any()
+    )
 
 
 def test_depth_and_silhouette_agree_with_cast():

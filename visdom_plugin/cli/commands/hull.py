@@ -14,7 +14,8 @@ import tyro
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import Reading, read_options
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.hull.domain import Box, VisibleDomain
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.settings import Box
 
 _DEFAULT = VisibleDomain()
 

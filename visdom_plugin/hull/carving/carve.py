@@ -1,10 +1,8 @@
-"""From cameras and masks to a Hull, as a VisibleDomain says."""
+"""The carve: from cameras and masks to a hull, as its settings say."""
 
 from __future__ import annotations
 
-import logging
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,118 +11,62 @@ from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.bounds import Region, cube_around, find_region, grid_in
 from visdom_plugin.hull.carving.culling import explaining_pieces
-from visdom_plugin.hull.carving.keep_rule import KeepRule, as_fraction
+from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.octree import block_carve, sum_areas
-from visdom_plugin.hull.carving.votes import Grid, Silhouettes, dense_carve, gather_silhouettes
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.carving.votes import Grid, Silhouettes, dense_carve
 from visdom_plugin.hull.grid.components import choose_pieces, erase_pieces, find_pieces
 from visdom_plugin.hull.hull import Hull, occupied_box
-
-log = logging.getLogger(__name__)
+from visdom_plugin.hull.settings import HullSettings
 
 _LOOSE, _TIGHTENINGS = 0.6, 3
 """Share of the grid's side below which what is kept gets a grid of its own, and how often."""
 
 
-def keep_rule(domain: VisibleDomain, views: int) -> KeepRule:
-    """The rule of a domain for a number of views; `k="auto"` must have been resolved."""
-    if domain.kind == "released-go":
-        return KeepRule(views, 0, None, least_occupied=max(views - 1, 1))
-    k = max(views - 1, 1) if domain.k == "n-1" else domain.k
-    least = k if domain.kind == "visdom" else 1
-    agreement = None if domain.max_misses is not None else as_fraction(domain.agreement)
-    return KeepRule(views, least, agreement, domain.max_misses)
-
-
-def carve(domain: VisibleDomain, cameras: Cameras, masks: Sequence) -> Hull:
-    """See `VisibleDomain.carve`."""
-    from visdom_plugin.hull.checks.coverage import choose_k, look_inverted
-    from visdom_plugin.hull.checks.explain_failure import explain_empty
-    from visdom_plugin.hull.checks.misfit import find_misfit
-
-    log.info("carving the hull (the first time on a machine its kernels are compiled: 10 to 30 s)")
-    silhouettes = gather_silhouettes(cameras, masks, domain.dilate_px)
-    asked = domain.k
-    if domain.k == "auto" and domain.kind != "released-go":
-        domain = replace(domain, k=choose_k(domain, cameras, silhouettes))
-    device = getattr(masks[0], "device", "cpu")
-    hull = carve_silhouettes(domain, cameras, silhouettes, device=device)
-    if hull is None:
-        raise explain_empty(domain, cameras, silhouettes)
-    hull.summary["k_asked"] = asked
-    misfit = find_misfit(domain, cameras, silhouettes, hull)
-    if misfit is not None:
-        log.warning(misfit)
-    elif not hull.summary["bounds_closed"]:
-        log.warning(
-            "the views leave the hull open: it is cut off at %s .. %s; more views from other sides, a larger k or "
-            "explicit bounds would close it",
-            *np.round(hull.bounds, 4).tolist(),
-        )
-    inverted = [i for i in range(len(silhouettes)) if look_inverted(silhouettes.mask(i))]
-    if 2 * len(inverted) > len(silhouettes):
-        log.warning(
-            "%d of %d masks are foreground along most of the image's border: they may mark the background; "
-            "`visdom-hull --diagnose` tells more",
-            len(inverted),
-            len(silhouettes),
-        )
-    dropped = hull.summary["components_dropped"]
-    log.info(
-        "hull: %s, %d views; %s; %d of %s voxels of %.4g, %d of %d pieces%s, %.2f s",
-        domain.kind, len(silhouettes), hull.summary["agreement_means"], hull.voxels,
-        "x".join(map(str, hull.shape)), hull.voxel_size, hull.summary["components"],
-        hull.summary["components_found"], dropped and f" ({dropped})",
-        hull.summary["seconds"] + hull.summary["bounds_seconds"],
-    )  # fmt: skip
-    return hull
-
-
 def carve_silhouettes(
-    domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes, *, device="cpu", effort: float = 1.0
+    settings: HullSettings, cameras: Cameras, silhouettes: Silhouettes, *, device="cpu", effort: float = 1.0
 ) -> Hull | None:
     """The hull, or None when nothing is left; `effort` as in `find_region`."""
-    rule = keep_rule(domain, len(silhouettes))
+    rule = KeepRule.of(settings, len(silhouettes))
     started = time.perf_counter()
     areas = sum_areas(silhouettes)
     summed = time.perf_counter()
-    placed = _place(domain, cameras, silhouettes, rule, areas, effort)
+    placed = _place(settings, cameras, silhouettes, rule, areas, effort)
     if placed is None:
         return None
     grid, ball, closed = placed
     located = time.perf_counter()
-    policy = _policy(domain, rule)
-    found = _carve_grid(domain, policy, silhouettes, rule, areas, grid, ball, device)
+    policy = _policy(settings, rule)
+    found = _carve_grid(settings, policy, silhouettes, rule, areas, grid, ball, device)
     # Cells tell less than voxels: where the search kept what the voxels then lost, the grid shrinks to the rest.
-    for _ in range(_TIGHTENINGS if policy == "explain" and domain.bounds is None else 0):
+    for _ in range(_TIGHTENINGS if policy == "explain" and settings.bounds is None else 0):
         if found is None:
             break
         occupancy, pieces, keep = found
         box = occupied_box(occupancy)
-        if (box[1] - box[0]).max() > _LOOSE * domain.resolution:
+        if (box[1] - box[0]).max() > _LOOSE * settings.resolution:
             break
         margin = np.array([[-1], [1]]) * (2 + 0.05 * (box[1] - box[0]).max())
-        grid = cube_around(grid.lower + (box + margin) * grid.voxel, domain.resolution)
-        found = _carve_grid(domain, policy, silhouettes, rule, areas, grid, ball, device)
+        grid = cube_around(grid.lower + (box + margin) * grid.voxel, settings.resolution)
+        found = _carve_grid(settings, policy, silhouettes, rule, areas, grid, ball, device)
     if found is None:
         return None
     occupancy, pieces, keep = found
     ended = time.perf_counter()
     summary = {
-        "kind": domain.kind,
+        "kind": settings.kind,
         "views": len(silhouettes),
         "k": rule.least_visible,
-        "agreement": None if rule.agreement is None else domain.agreement,
+        "agreement": None if rule.agreement is None else settings.agreement,
         "max_misses": rule.max_misses,
         "agreement_means": rule.meaning(),
-        "resolution": domain.resolution,
+        "resolution": settings.resolution,
         "components": int(keep.sum()),
         "components_found": len(keep),
         "components_rule": policy,
-        "components_dropped": _say_dropped(pieces.sizes, keep, policy, domain.min_component_fraction),
+        "components_dropped": _say_dropped(pieces.sizes, keep, policy, settings.min_component_fraction),
         "voxels_dropped": int(pieces.sizes[~keep].sum()),
         "bounds_closed": closed,
-        "dilate_px": domain.dilate_px,
+        "dilate_px": settings.dilate_px,
         # Votes to grid, and the search for the bounds, which explicit bounds save.
         "seconds": round(ended - located + summed - started, 4),
         "bounds_seconds": round(located - summed, 4),
@@ -135,7 +77,7 @@ def carve_silhouettes(
 
 
 def _carve_grid(
-    domain: VisibleDomain, policy: str, silhouettes, rule: KeepRule, areas, grid: Grid, ball, device
+    settings: HullSettings, policy: str, silhouettes, rule: KeepRule, areas, grid: Grid, ball, device
 ):
     """Occupancy after culling, its pieces before and which of them stayed; None for an empty grid."""
     if str(device) == "cpu":
@@ -150,48 +92,50 @@ def _carve_grid(
     if policy == "explain":
         keep = explaining_pieces(pieces, occupancy, grid, silhouettes, rule, areas)
     else:
-        keep = choose_pieces(pieces.sizes, policy, domain.min_component_fraction)
+        keep = choose_pieces(pieces.sizes, policy, settings.min_component_fraction)
     if not keep.all():
         erase_pieces(occupancy, pieces, keep)
     return occupancy, pieces, keep
 
 
-def _place(domain: VisibleDomain, cameras, silhouettes, rule: KeepRule, areas, effort: float):
+def _place(settings: HullSettings, cameras, silhouettes, rule: KeepRule, areas, effort: float):
     """Grid, ball (centre, radius) or None, and whether the views close the region; None for no region."""
-    needs_ball = domain.kind == "unit-sphere"
-    given = None if domain.bounds is None else np.array(domain.bounds, np.float64)
-    ball_given = domain.sphere_centre is not None and domain.sphere_radius is not None
+    needs_ball = settings.kind == "unit-sphere"
+    given = None if settings.bounds is None else np.array(settings.bounds, np.float64)
+    ball_given = settings.sphere_centre is not None and settings.sphere_radius is not None
     region = None
     if given is None or (needs_ball and not ball_given):
-        region = _visible_region(domain, cameras, silhouettes, rule, areas, effort)
+        region = _visible_region(settings, cameras, silhouettes, rule, areas, effort)
         if region is None:
             return None
     ball = None
     if needs_ball:
         box = None if region is None else region.bounds
-        centre = box.mean(0) if domain.sphere_centre is None else np.array(domain.sphere_centre, np.float64)
-        radius = domain.sphere_radius
+        centre = (
+            box.mean(0) if settings.sphere_centre is None else np.array(settings.sphere_centre, np.float64)
+        )
+        radius = settings.sphere_radius
         ball = centre, float(np.linalg.norm(box[1] - box[0]) / 2) if radius is None else float(radius)
     closed = region is None or region.closed
     if given is not None:
-        return grid_in(given, domain.resolution), ball, True
+        return grid_in(given, settings.resolution), ball, True
     box = region.bounds
     if ball is not None:
         box = np.stack([ball[0] - ball[1], ball[0] + ball[1]])
-    elif _one_view_is_enough(domain, rule):
+    elif _one_view_is_enough(settings, rule):
         centres = cameras.centres.double().cpu().numpy()
         box = np.stack([np.minimum(box[0], centres.min(0)), np.maximum(box[1], centres.max(0))])
-    return cube_around(box, domain.resolution), ball, closed
+    return cube_around(box, settings.resolution), ball, closed
 
 
-def _one_view_is_enough(domain: VisibleDomain, rule: KeepRule) -> bool:
-    return domain.kind == "traditional" or (domain.kind == "visdom" and rule.least_visible == 1)
+def _one_view_is_enough(settings: HullSettings, rule: KeepRule) -> bool:
+    return settings.kind == "traditional" or (settings.kind == "visdom" and rule.least_visible == 1)
 
 
-def _policy(domain: VisibleDomain, rule: KeepRule) -> str:
+def _policy(settings: HullSettings, rule: KeepRule) -> str:
     """What decides about the grid's pieces."""
-    baseline = domain.kind == "unit-sphere" or _one_view_is_enough(domain, rule)
-    return "drop-small" if domain.components == "explain" and baseline else domain.components
+    baseline = settings.kind == "unit-sphere" or _one_view_is_enough(settings, rule)
+    return "drop-small" if settings.components == "explain" and baseline else settings.components
 
 
 def _say_dropped(sizes: np.ndarray, keep: np.ndarray, policy: str, min_fraction: float) -> str:
@@ -206,17 +150,17 @@ def _say_dropped(sizes: np.ndarray, keep: np.ndarray, policy: str, min_fraction:
     return f"dropped {np.count_nonzero(~keep)}, {share:.2g} of the volume kept: {why}"
 
 
-def _visible_region(domain, cameras, silhouettes, rule: KeepRule, areas, effort: float) -> Region | None:
+def _visible_region(settings, cameras, silhouettes, rule: KeepRule, areas, effort: float) -> Region | None:
     def find(rule: KeepRule) -> Region | None:
-        fraction = 0.5 if domain.components == "largest" else domain.min_component_fraction
+        fraction = 0.5 if settings.components == "largest" else settings.min_component_fraction
         return find_region(
-            cameras, silhouettes, rule, domain.components, fraction, areas=areas, effort=effort
+            cameras, silhouettes, rule, settings.components, fraction, areas=areas, effort=effort
         )
 
-    if domain.kind == "released-go" or (domain.kind == "visdom" and rule.least_visible > 1):
+    if settings.kind == "released-go" or (settings.kind == "visdom" and rule.least_visible > 1):
         return find(rule)
     views = len(silhouettes)
-    start = keep_rule(replace(domain, kind="visdom"), views).least_visible
+    start = KeepRule.of(replace(settings, kind="visdom"), views).least_visible
     # With K = 1 the views close nothing: the box is that of the usual K.
     start = 3 if start == 1 else start
     for k in range(min(start, views), 0, -1):

@@ -5,6 +5,10 @@ from __future__ import annotations
 from fractions import Fraction
 from typing import NamedTuple
 
+import numpy as np
+
+from visdom_plugin.hull.settings import HullSettings
+
 
 class KeepRule(NamedTuple):
     """Keep when the votes agree and enough views see the voxel."""
@@ -20,6 +24,17 @@ class KeepRule(NamedTuple):
     least_occupied: int | None = None
     """n_occ >= this, in place of both: GaussianObject's released rule, with no count of visibility."""
 
+    @classmethod
+    def of(cls, settings: HullSettings, views: int) -> KeepRule:
+        """The rule that settings ask for with a number of views; `k="auto"` must have been resolved."""
+        if settings.kind == "released-go":
+            return cls(views, 0, None, least_occupied=max(views - 1, 1))
+        k = max(views - 1, 1) if settings.k == "n-1" else settings.k
+        if k == "auto":
+            raise ValueError("k is to be chosen first")
+        agreement = None if settings.max_misses is not None else as_fraction(settings.agreement)
+        return cls(views, k if settings.kind == "visdom" else 1, agreement, settings.max_misses)
+
     def keeps(self, visible: int, occupied: int) -> bool:
         """Whether a voxel seen by `visible` views and inside the mask of `occupied` of them stays."""
         if self.least_occupied is not None:
@@ -28,12 +43,11 @@ class KeepRule(NamedTuple):
             return False
         if self.max_misses is not None:
             return visible - occupied <= self.max_misses
+        assert self.agreement is not None
         return occupied * self.agreement.denominator >= self.agreement.numerator * visible
 
-    def table(self):
+    def table(self) -> np.ndarray:
         """(N + 1, N + 1) uint8 array: entry [n_vis, n_occ] is 1 where the voxel stays."""
-        import numpy as np
-
         table = np.zeros((self.views + 1, self.views + 1), np.uint8)
         for visible in range(self.views + 1):
             for occupied in range(visible + 1):
@@ -49,9 +63,9 @@ class KeepRule(NamedTuple):
             next(m for m in range(v, -1, -1) if self.keeps(v, v - m))
             for v in range(self.least_visible, n + 1)
         ]
-        said = (
-            f"max_misses {self.max_misses}" if self.max_misses is not None else f"{float(self.agreement):g}"
-        )
+        said = f"max_misses {self.max_misses}"
+        if self.agreement is not None:
+            said = f"{float(self.agreement):g}"
         if not misses:
             return f"{said} of at least {self.least_visible} views, but there are only {n}"
         allowed = {0: "not one miss is", 1: "one miss is"}.get(misses[-1], f"{misses[-1]} misses are")

@@ -81,8 +81,8 @@ def _judge(view, i0, i1, j0, j1, k0, k1, x, y, z, slack, sizes, starts, tables):
     ay, by = _span(y[view, 0, j0], y[view, 0, j1])
     az, bz = _span(z[view, 0, k0], z[view, 0, k1])
     u = (ax + ay + az) / depth
-    spread = abs(bx - u * dx) + abs(by - u * dy) + abs(bz - u * dz)
-    half = (spread + slack[view, 0] + 2 * abs(u) * slack[view, 2]) / nearest + 1e-9 + 1e-12 * abs(u)
+    reach_px = abs(bx - u * dx) + abs(by - u * dy) + abs(bz - u * dz)
+    half = (reach_px + slack[view, 0] + 2 * abs(u) * slack[view, 2]) / nearest + 1e-9 + 1e-12 * abs(u)
     u0, u1 = u - half, u + half
     if u1 < 0 or u0 >= width:
         return _UNSEEN
@@ -90,8 +90,8 @@ def _judge(view, i0, i1, j0, j1, k0, k1, x, y, z, slack, sizes, starts, tables):
     ay, by = _span(y[view, 1, j0], y[view, 1, j1])
     az, bz = _span(z[view, 1, k0], z[view, 1, k1])
     v = (ax + ay + az) / depth
-    spread = abs(bx - v * dx) + abs(by - v * dy) + abs(bz - v * dz)
-    half = (spread + slack[view, 1] + 2 * abs(v) * slack[view, 2]) / nearest + 1e-9 + 1e-12 * abs(v)
+    reach_px = abs(bx - v * dx) + abs(by - v * dy) + abs(bz - v * dz)
+    half = (reach_px + slack[view, 1] + 2 * abs(v) * slack[view, 2]) / nearest + 1e-9 + 1e-12 * abs(v)
     v0, v1 = v - half, v + half
     if v1 < 0 or v0 >= height:
         return _UNSEEN

@@ -11,13 +11,12 @@ import numpy as np
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.bounds import grid_in
-from visdom_plugin.hull.carving.carve import keep_rule
 from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.octree import block_carve, sum_areas
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes, gather_silhouettes
-from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
+from visdom_plugin.hull.settings import HullSettings
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +87,7 @@ def measure_coverage(hull: Hull, cameras: Cameras, masks: Sequence) -> list[Cove
 
 
 def diagnose(
-    domain: VisibleDomain, hull: Hull, cameras: Cameras, masks: Sequence, names: Sequence[str] | None = None
+    domain: HullSettings, hull: Hull, cameras: Cameras, masks: Sequence, names: Sequence[str] | None = None
 ) -> Diagnosis:
     """Looks for what keeps a hull from being a good one.
 
@@ -100,7 +99,7 @@ def diagnose(
     silhouettes = gather_silhouettes(cameras, masks, domain.dilate_px)
     names = [f"view {i}" for i in range(len(masks))] if names is None else list(names)
     grid = grid_in(hull.extent, COARSE)
-    rule = keep_rule(replace(domain, k=hull.summary.get("k", 1) or 1), len(silhouettes))
+    rule = KeepRule.of(replace(domain, k=hull.summary.get("k", 1) or 1), len(silhouettes))
     removed = leave_one_out(silhouettes, grid, rule)
     coverage = measure_coverage(hull, cameras, [silhouettes.mask(i) for i in range(len(silhouettes))])
     views = [
@@ -130,23 +129,23 @@ def leave_one_out(silhouettes: Silhouettes, grid: Grid, rule: KeepRule) -> list[
     return shares
 
 
-def votes_per_k(silhouettes: Silhouettes, grid: Grid, domain: VisibleDomain) -> dict[int, int]:
+def votes_per_k(silhouettes: Silhouettes, grid: Grid, domain: HullSettings) -> dict[int, int]:
     """Voxels of `grid` that pass the agreement and are seen by at least 1, 2, ..., N views."""
     counts, areas = {}, sum_areas(silhouettes)
     for k in range(1, len(silhouettes) + 1):
-        rule = keep_rule(replace(domain, k=k, kind="visdom"), len(silhouettes))
+        rule = KeepRule.of(replace(domain, k=k, kind="visdom"), len(silhouettes))
         counts[k] = int(np.count_nonzero(block_carve(silhouettes, grid, rule, areas)))
     return counts
 
 
-def choose_k(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes) -> int:
+def choose_k(cameras: Cameras, silhouettes: Silhouettes) -> int:
     """The K that `advise_k` advises: the largest of 3, 2, 1 whose hull covers every mask as K = 1 does."""
     # These need OpenCV, which carving with a given K does not.
     from visdom_plugin.hull.checks.covisibility import advise_k
     from visdom_plugin.hull.checks.distance_fields import draw_outlines
 
     advice = advise_k(draw_outlines(cameras, silhouettes))
-    log.info("k=%s takes %s", domain.k, advice.why)
+    log.info("k=auto takes %s", advice.why)
     return advice.k
 
 

@@ -10,10 +10,11 @@ import torch
 
 from visdom_plugin.errors import EmptyHullError
 from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.hull.carving.carve import carve_silhouettes, keep_rule
+from visdom_plugin.hull.carving.carve import carve_silhouettes
+from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Silhouettes
 from visdom_plugin.hull.checks.coverage import COARSE, look_inverted, measure_coverage
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.settings import HullSettings
 
 COMMAND = "visdom-hull DIR --diagnose"
 _CONVINCING = 0.9
@@ -22,14 +23,14 @@ _EFFORT = 0.1
 """Of the search for a trial hull's box: wrong suspicions leave many cells undecided and should fail soon."""
 
 
-def explain_empty(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes) -> EmptyHullError:
+def explain_empty(domain: HullSettings, cameras: Cameras, silhouettes: Silhouettes) -> EmptyHullError:
     """The error for an empty hull, with the likeliest cause if one of these could be established.
 
     In this order: empty masks; K above the number of views; inverted masks; explicit bounds or a ball beside the
     hull; poses in another convention; K above what the views see in common; a single view that disagrees.
     """
     views = len(silhouettes)
-    rule = keep_rule(domain, views)
+    rule = KeepRule.of(domain, views)
     what = f"the hull is empty: no voxel satisfies the keep rule ({rule.meaning()}, K = {rule.least_visible})"
     if domain.kind == "released-go":
         what = f"the hull is empty: no voxel is {rule.meaning()}"
@@ -62,7 +63,7 @@ def ways_to_set_k(k: int) -> str:
     return f"K = {k} (visdom-hull -k {k}, visdom-train --method.hull.k {k}, VisibleDomain(k={k}))"
 
 
-def _try(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes) -> float:
+def _try(domain: HullSettings, cameras: Cameras, silhouettes: Silhouettes) -> float:
     """Mean share that a coarse hull covers of the masks of the views that see it, 0 without one."""
     hull = carve_silhouettes(replace(domain, resolution=COARSE), cameras, silhouettes, effort=_EFFORT)
     if hull is None:
@@ -84,7 +85,7 @@ def _empty_masks(domain, cameras, silhouettes):
 
 
 def _too_few_views(domain, cameras, silhouettes):
-    k = keep_rule(domain, len(silhouettes)).least_visible
+    k = KeepRule.of(domain, len(silhouettes)).least_visible
     if k <= len(silhouettes):
         return None
     cause = f"K = {k} is larger than co-visibility allows: there are only {len(silhouettes)} views"
@@ -124,7 +125,7 @@ def _inverted(domain, cameras, silhouettes):
     return cause, "invert them: True (white) on the object", _list(flagged)
 
 
-def find_convention(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes):
+def find_convention(domain: HullSettings, cameras: Cameras, silhouettes: Silhouettes):
     """Cause, what to do and where, when the poses read in another convention explain the masks; or None."""
     flip = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
     motion = cameras.world_from_camera.double().cpu()
@@ -155,7 +156,7 @@ def find_convention(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhou
 def _covisibility(domain, cameras, silhouettes):
     if domain.kind != "visdom":
         return None
-    k = keep_rule(domain, len(silhouettes)).least_visible
+    k = KeepRule.of(domain, len(silhouettes)).least_visible
     for fewer in range(k - 1, 0, -1):
         if _try(replace(domain, k=fewer), cameras, silhouettes) >= _CONVINCING:
             cause = f"K = {k} is larger than co-visibility: too little is seen by more than {fewer}"
@@ -167,7 +168,7 @@ def _single_view(domain, cameras, silhouettes):
     if len(silhouettes) < 3:
         return None
     index = np.arange(len(silhouettes))
-    k = keep_rule(domain, len(silhouettes)).least_visible
+    k = KeepRule.of(domain, len(silhouettes)).least_visible
     scores = []
     for view in index:
         rest = torch.from_numpy(index[index != view])

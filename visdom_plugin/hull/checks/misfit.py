@@ -16,8 +16,8 @@ from visdom_plugin.geometry.cameras import Cameras, rays_of
 from visdom_plugin.hull.carving.votes import Silhouettes
 from visdom_plugin.hull.checks.coverage import measure_coverage
 from visdom_plugin.hull.checks.explain_failure import COMMAND, find_convention
-from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
+from visdom_plugin.hull.settings import HullSettings
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +29,7 @@ _RAYS, _STEPS = 512, 256
 """Of the first look, over all views, and along each ray."""
 
 
-def find_misfit(domain: VisibleDomain, cameras: Cameras, silhouettes: Silhouettes, hull: Hull) -> str | None:
+def find_misfit(domain: HullSettings, cameras: Cameras, silhouettes: Silhouettes, hull: Hull) -> str | None:
     """A sentence for the user when the hull leaves most of the masks uncovered, or None.
 
     Raises:

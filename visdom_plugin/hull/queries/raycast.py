@@ -239,7 +239,7 @@ def _cast(begin, end, origins, directions, lower, scale, box, shape, bits, ahead
 def cast(hull: Hull, origins, directions) -> Crossing:
     """First entry into and last exit from the occupied voxels, exact to rounding.
 
-    On the CPU numba walks the voxels, on CUDA `march` does it in torch.
+    On the CPU numba walks the voxels, on CUDA `cast_with_torch` does it in torch.
 
     Args:
         origins, directions: (..., 3) tensors or arrays, broadcast against each other; world frame; directions of
@@ -252,7 +252,7 @@ def cast(hull: Hull, origins, directions) -> Crossing:
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
     dtype = directions.dtype if directions.is_floating_point() else torch.float64
     if directions.device.type != "cpu":
-        first, last, hit = march(hull, origins, directions)
+        first, last, hit = cast_with_torch(hull, origins, directions)
         return Crossing(first.to(dtype), last.to(dtype), hit)
     first, last, hit = _walk(hull, origins, directions, shape, both=True)
     return Crossing(first.to(dtype), last.to(dtype), hit)
@@ -275,7 +275,7 @@ def _walk(hull: Hull, origins: Tensor, directions: Tensor, shape, *, both: bool)
     return tuple(torch.from_numpy(x).reshape(shape) for x in (first, last, hit))
 
 
-def march(hull: Hull, origins: Tensor, directions: Tensor) -> Crossing:
+def cast_with_torch(hull: Hull, origins: Tensor, directions: Tensor) -> Crossing:
     """`cast` in torch on the rays' device: all rays advance together through the brick distances.
 
     Same arguments and result as `cast`, in float64.
@@ -350,7 +350,7 @@ def depth_and_silhouette(hull: Hull, camera: Cameras) -> tuple[Tensor, Tensor]:
     directions = x[:, None] * right + (y[:, None] * down + ahead)[:, None, :]
     origin = motion[:3, 3]
     if directions.device.type != "cpu":
-        crossing = march(hull, origin, directions)
+        crossing = cast_with_torch(hull, origin, directions)
         return crossing.t_first.float(), crossing.hit
     first, _, hit = _walk(hull, origin, directions, (height, width), both=False)
     return first.float(), hit

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from visdom_plugin.hull.hull import write_whole
+from visdom_plugin.atomic_files import write_bytes
 from visdom_plugin.integrations.nerfstudio.frame import Similarity
 from visdom_plugin.scene import Views
 
@@ -58,6 +58,5 @@ def _write(pixels: np.ndarray, cache: Path, name: str) -> Path:
     safe = re.sub(r"[^\w.+-]+", "_", Path(name).stem).strip(".") or "view"
     path = cache / content[:24] / f"{safe}.png"
     if not path.exists():
-        png = cv2.imencode(".png", pixels)[1].tobytes()
-        write_whole(path, lambda file: file.write(png))
+        write_bytes(path, cv2.imencode(".png", pixels)[1].tobytes())
     return path
