@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from visdom_plugin.hooks.configs import RegularizerConfig
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.domain import TRAINING_DOMAIN
 from visdom_plugin.methods.splats.configs import CorgsConfig
 from visdom_plugin.registry import Preset
 
@@ -36,7 +36,7 @@ QUICK = CorgsConfig(
 MASK = {"mask_weight": 0.1}
 
 # As with 3DGS-GO: one pixel of dilation keeps the unanimity of few views from eating thin parts of the hull.
-VD = MASK | {"hull": VisibleDomain(dilate_px=1), "vd": RegularizerConfig(enabled=True)}
+VD = MASK | {"hull": TRAINING_DOMAIN, "vd": RegularizerConfig(enabled=True)}
 
 
 def _preset(suffix: str, description: str, changes: dict) -> Preset:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from visdom_plugin.hooks.configs import RegularizerConfig
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.domain import TRAINING_DOMAIN
 from visdom_plugin.methods.splats.configs import GsGoConfig
 from visdom_plugin.registry import Preset
 
@@ -33,10 +33,9 @@ QUICK = GsGoConfig(
 MASK = {"mask_weight": 0.1}
 
 # What the hull knows replaces what statistics guess: Gaussians outside it are removed, and the base method's
-# removal of stray ones, which eats thin parts, is off. One pixel of dilation keeps the unanimity of few views
-# from eating them in the hull. FINDINGS.md has the numbers.
+# removal of stray ones, which eats thin parts, is off. FINDINGS.md has the numbers.
 VD = MASK | {
-    "hull": VisibleDomain(dilate_px=1),
+    "hull": TRAINING_DOMAIN,
     "vd": RegularizerConfig(enabled=True),
     "floater_every": 0,
 }

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from visdom_plugin.hooks.configs import SamplerConfig
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.domain import TRAINING_DOMAIN
 from visdom_plugin.methods.fields.configs import IngpConfig
 from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 from visdom_plugin.registry import Preset
@@ -34,7 +34,7 @@ QUICK = IngpConfig(
 # The vanilla variant sees photographs on white. Those that use masks see them on random colours, too: a photograph
 # with alpha is what Instant-NGP is made for. FINDINGS.md has what it brings.
 MASK = {"mask_weight": 0.1, "background": "random"}
-VD = MASK | {"hull": VisibleDomain(dilate_px=1), "vd": SamplerConfig(enabled=True)}
+VD = MASK | {"hull": TRAINING_DOMAIN, "vd": SamplerConfig(enabled=True)}
 
 
 def _preset(suffix: str, description: str, changes: dict) -> Preset:

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 from method_configs.ingp import FULL, QUICK
 from visdom_plugin.hooks.configs import SamplerConfig
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.domain import TRAINING_DOMAIN
 from visdom_plugin.registry import Preset
 
 SAMPLER = SamplerConfig(enabled=True, epsilon_world=0.0, missing="skip", drop_outside=True)
-HULL = VisibleDomain(kind="unit-sphere", dilate_px=1)
+HULL = replace(TRAINING_DOMAIN, kind="unit-sphere")
 
 
 def _preset(suffix: str, description: str, sampler: SamplerConfig) -> Preset:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from visdom_plugin.hooks.configs import SamplerConfig
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.domain import TRAINING_DOMAIN
 from visdom_plugin.methods.fields.configs import ZipNerfConfig
 from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 from visdom_plugin.registry import Preset
@@ -37,7 +37,7 @@ QUICK = ZipNerfConfig(
 )
 
 MASK = {"mask_weight": 0.1, "background": "random"}
-VD = MASK | {"hull": VisibleDomain(dilate_px=1), "vd": SamplerConfig(enabled=True), "samples": (12, 12, 14)}
+VD = MASK | {"hull": TRAINING_DOMAIN, "vd": SamplerConfig(enabled=True), "samples": (12, 12, 14)}
 
 
 def _preset(suffix: str, description: str, changes: dict) -> Preset:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from visdom_plugin.errors import ConfigError, PluginError
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.domain import TRAINING_DOMAIN, VisibleDomain
 
 HOOKS = {"sampler": SamplerConfig, "gaussian": RegularizerConfig}
 """By the hook a method takes, the settings of that hook."""
@@ -199,8 +199,7 @@ class MethodSpec:
     def _change(self, config: Any, suffix: str) -> Any:
         changes: dict[str, Any] = {"mask_weight": MASK_WEIGHT}
         if suffix == "vd":
-            # One pixel of dilation keeps the unanimity of few views from eating thin parts.
-            changes["hull"] = VisibleDomain(dilate_px=1)
+            changes["hull"] = TRAINING_DOMAIN
             changes["vd"] = replace(HOOKS[self.hook](), enabled=True)
             if is_dataclass(config.vd):
                 changes["vd"] = replace(config.vd, enabled=True)

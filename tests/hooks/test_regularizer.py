@@ -10,6 +10,7 @@ import torch
 from visdom_plugin import Cameras, Hull, Render, VisDomGaussianRegularizer, VisibleDomain
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import look_at_camera, project, rays_of
+from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hooks.regularizer import outside_loss
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
@@ -185,6 +186,17 @@ def test_all_gaussians_outside_the_hull_are_told_of_once(ball, caplog):
             assert hook.after_step(SimpleNamespace(means=inside + 100), step).all()
     (record,) = caplog.records
     assert "another frame" in record.getMessage()
+
+
+def test_there_is_one_set_of_defaults(ball):
+    cameras, hull = ball
+    hook = VisDomGaussianRegularizer(hull, cameras)
+    assert hook.config == RegularizerConfig()
+    means = CENTRE[None].float() + 100
+    marked = [hook.after_step(SimpleNamespace(means=means), step) is not None for step in range(101)]
+    assert [step for step, due in enumerate(marked) if due] == [0, 50, 100]
+    given = VisDomGaussianRegularizer(hull, cameras, RegularizerConfig(bank=3), weight=0.5)
+    assert given.config == RegularizerConfig(bank=3, weight=0.5)
 
 
 def test_a_schedule_needs_the_step(ball):

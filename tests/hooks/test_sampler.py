@@ -10,7 +10,7 @@ import torch
 from visdom_plugin import Hull, VisDomSampler
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import SamplerConfig
-from visdom_plugin.hooks.protocols import SamplerHook
+from visdom_plugin.hooks.protocols import SampleFilter, SamplerHook, sample_filters
 from visdom_plugin.hull.queries.raycast import cast
 from visdom_plugin.scene import Views
 
@@ -147,6 +147,29 @@ def test_the_unit_of_epsilon_is_what_its_name_says(hull):
     )
 
 
+def test_there_is_one_set_of_defaults(hull):
+    """The methods' hook, the three lines, and a config with changes are the same settings."""
+    cameras = ring(5, distance=4.0)
+    views = Views(cameras, [None] * 5, [None] * 5, list("abcde"))
+    built, direct = SamplerConfig(enabled=True).build(hull, views), VisDomSampler(hull, cameras=cameras)
+    assert direct.epsilon_world == built.epsilon_world
+    assert direct.config == SamplerConfig() == VisDomSampler(hull).config
+    assert VisDomSampler(hull).epsilon_world == pytest.approx(0.1 * hull.radius)
+    given = VisDomSampler(hull, SamplerConfig(missing="skip"), interval="first_hit", cameras=cameras)
+    assert given.config == SamplerConfig(missing="skip", interval="first_hit")
+    with pytest.raises(TypeError, match="mising"):
+        VisDomSampler(hull, mising="skip")
+
+
+def test_only_hooks_that_say_so_filter_samples(hull):
+    class BoundsOnly:
+        def bound(self, origins, directions, near, far): ...
+
+    silent, speaking = VisDomSampler(hull), VisDomSampler(hull, drop_outside=True)
+    assert isinstance(silent, SampleFilter) and not isinstance(BoundsOnly(), SampleFilter)
+    assert sample_filters([silent, speaking, BoundsOnly()]) == [speaking]
+
+
 @pytest.mark.parametrize(
     "settings",
     [
@@ -154,6 +177,7 @@ def test_the_unit_of_epsilon_is_what_its_name_says(hull):
         {"epsilon_world": float("nan")},
         {"epsilon_world": 0.0, "interval": "first_hit"},
         {"epsilon_world": 0.1, "epsilon_hull_radii": 0.1},
+        {"epsilon_camera_distances": -0.1},
         {"interval": "exit"},
         {"missing": "drop"},
     ],

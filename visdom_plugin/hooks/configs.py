@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from visdom_plugin.hooks.regularizer import VisDomGaussianRegularizer
+    from visdom_plugin.hooks.sampler import VisDomSampler
+    from visdom_plugin.hull.hull import Hull
+    from visdom_plugin.scene import Views
 
 
 @dataclass(frozen=True)
 class SamplerConfig:
-    """VisDomSampler: a band around the hull outside which no samples are taken. One epsilon counts."""
+    """Settings of VisDomSampler: a band around the hull outside which no samples are taken."""
 
     enabled: bool = False
     """Whether the hook takes part at all; off leaves the base method unchanged."""
-    epsilon_camera_distances: float | None = 0.03
+    epsilon_camera_distances: float = 0.03
     """Half width of the band, in mean distances from the training cameras to the hull's centre (the paper's 0.2
     for cameras at distance 1)."""
     epsilon_hull_radii: float | None = None
-    """The same in radii of the hull; wins over camera distances."""
+    """The same in radii of the hull, in place of camera distances."""
     epsilon_world: float | None = None
-    """The same in units of the scene; wins over both."""
+    """The same in units of the scene; give one of these two."""
     interval: Literal["first_hit", "entry_exit"] = "entry_exit"
     """Around the first hit, as the paper writes, or from before the first to behind the last."""
     missing: Literal["full", "skip"] = "full"
@@ -28,25 +34,16 @@ class SamplerConfig:
     drop_outside: bool = False
     """Of the samples in the band, those at points outside the hull count nothing (VaxNeRF; Instant-NGP only)."""
 
-    def build(self, hull, views):
+    def build(self, hull: Hull, views: Views) -> VisDomSampler:
         """The hook for one hull, and the training views whose mean distance is the unit."""
         from visdom_plugin.hooks.sampler import VisDomSampler
 
-        epsilon = {"epsilon_world": self.epsilon_world}
-        if self.epsilon_world is None and self.epsilon_hull_radii is not None:
-            epsilon = {"epsilon_hull_radii": self.epsilon_hull_radii}
-        elif self.epsilon_world is None and self.epsilon_camera_distances is not None:
-            distances = ((c - hull.centre) @ (c - hull.centre) for c in views.cameras.centres.numpy())
-            mean = sum(d**0.5 for d in distances) / len(views)
-            epsilon = {"epsilon_world": self.epsilon_camera_distances * mean}
-        return VisDomSampler(
-            hull, **epsilon, interval=self.interval, missing=self.missing, drop_outside=self.drop_outside
-        )
+        return VisDomSampler(hull, self, cameras=views.cameras)
 
 
 @dataclass(frozen=True)
 class RegularizerConfig:
-    """VisDomGaussianRegularizer: hull points to start from, and the loss L_i on views between the cameras."""
+    """Settings of VisDomGaussianRegularizer: points to start from, and the loss L_i on views between cameras."""
 
     enabled: bool = False
     """Whether the hook takes part at all; off leaves the base method unchanged."""
@@ -68,20 +65,8 @@ class RegularizerConfig:
     prune_margin_voxels: float = 2.0
     """How far outside the hull a centre may lie before it is removed, in voxels of the hull's grid."""
 
-    def build(self, hull, views):
+    def build(self, hull: Hull, views: Views) -> VisDomGaussianRegularizer:
         """The hook for one hull and the training views whose colours the initial points take."""
         from visdom_plugin.hooks.regularizer import VisDomGaussianRegularizer
 
-        return VisDomGaussianRegularizer(
-            hull,
-            views.cameras,
-            images=views.images,
-            weight=self.weight,
-            every=self.every,
-            start=self.start,
-            views_per_step=self.views_per_step,
-            bank=self.bank,
-            points=self.points,
-            prune_every=self.prune_every,
-            prune_margin_voxels=self.prune_margin_voxels,
-        )
+        return VisDomGaussianRegularizer(hull, views.cameras, self, images=views.images)

@@ -1,4 +1,4 @@
-"""The two places where a constraint enters a trainer.
+"""Protocols of the hooks: the places where a constraint enters a trainer.
 
 Hooks never own an optimiser, never step, never know the method's name and never import a rasteriser: they
 are handed callables. Several hooks are a list, applied in order.
@@ -6,7 +6,7 @@ are handed callables. Several hooks are a list, applied in order.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Generator, Tensor
@@ -45,6 +45,29 @@ class SamplerHook(Protocol):
             near, far: (...) the method's own bounds; where far < near there is nothing to sample.
         """
         ...
+
+
+@runtime_checkable
+class SampleFilter(Protocol):
+    """What a sampler hook may offer besides: a say about each sample (VaxNeRF, Kondo et al. 2021).
+
+    Bounds alone let a ray sample the gaps between the parts of a hull. A method that drops single samples asks
+    `sample_filters(hooks)`; one that cannot refuses the setting `vd.drop_outside`.
+    """
+
+    @property
+    def drop_outside(self) -> bool:
+        """Whether `keep` has a say; where it has not, it need not be asked."""
+        ...
+
+    def keep(self, points: Tensor) -> Tensor:
+        """(...) bool of sample points (..., 3), world frame: False where they shall count nothing."""
+        ...
+
+
+def sample_filters(hooks: Sequence[object]) -> list[SampleFilter]:
+    """The hooks that have a say about single samples."""
+    return [hook for hook in hooks if isinstance(hook, SampleFilter) and hook.drop_outside]
 
 
 @runtime_checkable

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from torch import Generator, Tensor
 
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import Cameras, interpolate, project, require_batch
+from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.point_colours import check_images, colour_points
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
@@ -98,17 +100,13 @@ class VisDomGaussianRegularizer:
 
     Args:
         hull: the visible domain; fixed from here on.
-        cameras: (N,) training cameras, N >= 2; their interpolation gives the views of L_i.
+        cameras: (N,) training cameras, N >= 2; their interpolation gives the views of L_i. The bank of views is
+            the same for every hook with the same hull and cameras, so that runs can resume.
+        config: its settings, RegularizerConfig's own by default. Whether it is `enabled` is a method's to read:
+            the hook itself is on.
         images: N tensors or arrays (H, W, 3) of the cameras' sizes, integers in 0..255 or floats in [0, 1], that
             colour the initial points; grey without.
-        weight: lambda_3, the weight of L_i; the paper uses 0.01.
-        every, start: L_i is added on steps start, start + every, ...
-        views_per_step: interpolated views per loss.
-        bank: views to draw from, each made and its silhouette cast once, when first drawn; 0 draws new ones
-            every time. The same for every hook with the same hull and cameras, so that runs can resume.
-        points: "surface" draws initial points on the hull's surface, "volume" anywhere inside it.
-        prune_every: `after_step` marks Gaussians outside the hull on every n-th step; 0 never.
-        prune_margin_voxels: how far outside the hull a centre may lie, in voxels.
+        settings: single fields of the config to change: `VisDomGaussianRegularizer(hull, cameras, weight=0.1)`.
 
     Raises:
         ConfigError: for fewer than two cameras, a setting out of range, images that do not fit the cameras, or a
@@ -119,16 +117,10 @@ class VisDomGaussianRegularizer:
         self,
         hull: Hull,
         cameras: Cameras,
+        config: RegularizerConfig | None = None,
         *,
         images: Sequence[Tensor | np.ndarray] | None = None,
-        weight: float = 0.01,
-        every: int = 1,
-        start: int = 0,
-        views_per_step: int = 1,
-        bank: int = 64,
-        points: Literal["surface", "volume"] = "volume",
-        prune_every: int = 0,
-        prune_margin_voxels: float = 2.0,
+        **settings: Any,
     ):
         require_batch(cameras, "VisDomGaussianRegularizer")
         if len(cameras) < 2:
@@ -136,18 +128,19 @@ class VisDomGaussianRegularizer:
                 "VisDomGaussianRegularizer needs at least two training cameras to interpolate between",
                 todo="pass the batch of all training cameras",
             )
+        self.config = c = replace(config or RegularizerConfig(), **settings)
         if not (
-            0 <= weight < math.inf
-            and every >= 1
-            and views_per_step >= 1
-            and bank >= 0
-            and points in ("surface", "volume")
-            and prune_every >= 0
-            and 0 <= prune_margin_voxels < math.inf
+            0 <= c.weight < math.inf
+            and c.every >= 1
+            and c.views_per_step >= 1
+            and c.bank >= 0
+            and c.points in ("surface", "volume")
+            and c.prune_every >= 0
+            and 0 <= c.prune_margin_voxels < math.inf
         ):
             raise ConfigError(
-                f"weight={weight}, every={every}, views_per_step={views_per_step}, bank={bank}, "
-                f"points={points!r}, prune_every={prune_every}, prune_margin_voxels={prune_margin_voxels}: "
+                f"weight={c.weight}, every={c.every}, views_per_step={c.views_per_step}, bank={c.bank}, "
+                f"points={c.points!r}, prune_every={c.prune_every}, prune_margin_voxels={c.prune_margin_voxels}: "
                 "weight, bank, prune_every and prune_margin_voxels must be >= 0, every and views_per_step >= 1, "
                 "points 'surface' or 'volume'",
                 where="VisDomGaussianRegularizer",
@@ -156,17 +149,14 @@ class VisDomGaussianRegularizer:
         _check_frame(hull, self.cameras)
         self.images = None if images is None else check_images(images, self.cameras)
         self._device = cameras.width.device
-        self.weight, self.every, self.start, self.views_per_step = weight, every, start, views_per_step
-        self.bank, self._bank = bank, {}
-        self.points, self.prune_every = points, prune_every
-        self.prune_margin_voxels = prune_margin_voxels
+        self._bank: dict[int, tuple[Cameras, Tensor]] = {}
         self._look_at = torch.as_tensor(hull.centre).to(self.cameras.world_from_camera)
         self._warned = False
 
     def initial_points(self, n: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
         """Points to start from: xyz (n, 3) float32 world frame and rgb (n, 3) float32 in [0, 1], on the device
         of the training cameras."""
-        draw = self.hull.sample_points if self.points == "surface" else self.hull.sample_inside
+        draw = self.hull.sample_points if self.config.points == "surface" else self.hull.sample_inside
         xyz = draw(n, generator).float()
         if self.images is None:
             rgb = torch.full_like(xyz, 0.5)
@@ -201,32 +191,32 @@ class VisDomGaussianRegularizer:
         """
         if not self._is_due(step):
             return {}
-        total = 0.0
-        for _ in range(self.views_per_step):
+        losses = []
+        for _ in range(self.config.views_per_step):
             camera, mask = self._draw(generator)
-            drawn = render(camera.to(self._device))
-            alpha = _opacity(drawn, mask.shape)
-            total = total + outside_loss(alpha, mask.to(alpha.device))
-        return {"visdom_outside": self.weight / self.views_per_step * total}
+            alpha = _opacity(render(camera.to(self._device)), mask.shape)
+            losses.append(outside_loss(alpha, mask.to(alpha.device)))
+        return {"visdom_outside": self.config.weight / len(losses) * sum(losses[1:], losses[0])}
 
     def _is_due(self, step: int | None) -> bool:
+        c = self.config
         if step is None:
-            if self.every > 1 or self.start > 0:
+            if c.every > 1 or c.start > 0:
                 raise ConfigError(
-                    f"every={self.every} and start={self.start} need the trainer's step",
+                    f"every={c.every} and start={c.start} need the trainer's step",
                     where="VisDomGaussianRegularizer.loss",
                     todo="call hook.loss(render, step)",
                 )
-            step = self.start
-        return self.weight > 0 and step >= self.start and (step - self.start) % self.every == 0
+            step = c.start
+        return c.weight > 0 and step >= c.start and (step - c.start) % c.every == 0
 
     @_outside_graphs
     def _draw(self, generator: Generator | None) -> tuple[Cameras, Tensor]:
         """A view and the hull's silhouette in it, (H, W) bool."""
-        if not self.bank:
+        if not self.config.bank:
             camera = self.sample_camera(generator)
             return camera, depth_and_silhouette(self.hull, camera)[1]
-        index = int(torch.randint(self.bank, (), generator=generator))
+        index = int(torch.randint(self.config.bank, (), generator=generator))
         if index not in self._bank:
             camera = self.sample_camera(torch.Generator().manual_seed(index))
             self._bank[index] = camera, depth_and_silhouette(self.hull, camera)[1]
@@ -237,9 +227,9 @@ class VisDomGaussianRegularizer:
 
         Warns once when they are all outside, which trainers take for no reason to remove them.
         """
-        if not self.prune_every or step % self.prune_every:
+        if not self.config.prune_every or step % self.config.prune_every:
             return None
-        outside = ~self.hull.contains(gaussians.means.detach(), margin_voxels=self.prune_margin_voxels)
+        outside = ~self.hull.contains(gaussians.means.detach(), margin_voxels=self.config.prune_margin_voxels)
         if len(outside) and not self._warned and bool(outside.all()):
             self._warned = True
             log.warning("all %d Gaussians lie outside the hull: is it in another frame?", len(outside))

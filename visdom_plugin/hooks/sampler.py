@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks import torch_ops
+from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.raycast import cast
 
-DEFAULT_EPSILON_HULL_RADII = 0.1
-"""About 0.03 camera distances for an object that fills half the picture; FINDINGS.md has the sweep."""
+CAMERA_DISTANCE_HULL_RADII = 10 / 3
+"""How far cameras are that nobody told of: about where the object fills half of the picture."""
 
 
-def _limit(value, like: Tensor) -> Tensor:
+def _limit(value: Tensor | float, like: Tensor) -> Tensor:
     value = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     try:
         return value.expand(like.shape)
@@ -27,6 +30,25 @@ def _limit(value, like: Tensor) -> Tensor:
             where="VisDomSampler.bound",
             todo="pass a number, or one value per ray without a last dimension of size 1: near[..., 0]",
         ) from error
+
+
+def _epsilon_world(config: SamplerConfig, hull: Hull, cameras: Cameras | None) -> float:
+    """Half width of the band in scene units."""
+    if config.epsilon_hull_radii is not None and config.epsilon_world is not None:
+        raise ConfigError(
+            f"epsilon is given twice: {config.epsilon_hull_radii} hull radii and {config.epsilon_world} scene "
+            "units",
+            todo="give one of epsilon_hull_radii and epsilon_world",
+        )
+    if config.epsilon_world is not None:
+        return config.epsilon_world
+    if config.epsilon_hull_radii is not None:
+        return config.epsilon_hull_radii * hull.radius
+    distance = CAMERA_DISTANCE_HULL_RADII * hull.radius
+    if cameras is not None:
+        offsets = cameras.centres.cpu().numpy() - hull.centre
+        distance = sum((d @ d) ** 0.5 for d in offsets) / len(cameras)
+    return config.epsilon_camera_distances * distance
 
 
 class VisDomSampler:
@@ -48,13 +70,11 @@ class VisDomSampler:
 
     Args:
         hull: the visible domain; fixed from here on.
-        epsilon_hull_radii: half width of the band in units of `hull.radius`.
-        epsilon_world: the same in scene units; give one of the two.
-        interval: see above.
-        missing: what happens to rays that miss the hull. "full" leaves them the caller's bounds, so that a mask
-            loss clears the space around the object; "skip" gives them an empty interval, near = far.
-        drop_outside: the method shall ask `keep` about each sample, too (VaxNeRF, Kondo et al. 2021). Bounds alone
-            let a ray sample the gaps between the parts of a hull.
+        config: its settings, SamplerConfig's own by default. Whether it is `enabled`, and where, is a method's to
+            read: the hook itself is on.
+        cameras: (N,) training cameras, whose mean distance from the hull's centre is the unit of
+            `epsilon_camera_distances`; without them it is 10/3 radii of the hull.
+        settings: single fields of the config to change: `VisDomSampler(hull, missing="skip")`.
 
     Raises:
         ConfigError: for a setting out of range, or an epsilon in two units.
@@ -63,45 +83,45 @@ class VisDomSampler:
     def __init__(
         self,
         hull: Hull,
+        config: SamplerConfig | None = None,
         *,
-        epsilon_hull_radii: float | None = None,
-        epsilon_world: float | None = None,
-        interval: Literal["first_hit", "entry_exit"] = "entry_exit",
-        missing: Literal["full", "skip"] = "full",
-        drop_outside: bool = False,
+        cameras: Cameras | None = None,
+        **settings: Any,
     ):
-        if epsilon_hull_radii is not None and epsilon_world is not None:
+        self.hull = hull
+        self.config = config = replace(config or SamplerConfig(), **settings)
+        if config.interval not in ("first_hit", "entry_exit") or config.missing not in ("full", "skip"):
             raise ConfigError(
-                f"epsilon is given twice: {epsilon_hull_radii} hull radii and {epsilon_world} scene units",
-                todo="give one of epsilon_hull_radii and epsilon_world",
+                f"interval={config.interval!r}, missing={config.missing!r}: interval must be 'first_hit' or "
+                "'entry_exit', missing 'full' or 'skip'"
             )
-        if interval not in ("first_hit", "entry_exit") or missing not in ("full", "skip"):
+        self.epsilon_world = epsilon = float(_epsilon_world(config, hull, cameras))
+        if not 0 <= epsilon < float("inf") or (config.interval == "first_hit" and epsilon == 0):
             raise ConfigError(
-                f"interval={interval!r}, missing={missing!r}: interval must be 'first_hit' or 'entry_exit', "
-                "missing 'full' or 'skip'"
-            )
-        if epsilon_world is None:
-            radii = DEFAULT_EPSILON_HULL_RADII if epsilon_hull_radii is None else epsilon_hull_radii
-            epsilon_world = radii * hull.radius
-        if not 0 <= epsilon_world < float("inf") or (interval == "first_hit" and epsilon_world == 0):
-            raise ConfigError(
-                f"epsilon = {epsilon_world:g} scene units leaves no band to sample",
+                f"epsilon = {epsilon:g} scene units leaves no band to sample",
                 cause="an empty hull, or an epsilon that is negative, zero or not a number",
-                todo="give a positive epsilon_hull_radii or epsilon_world",
+                todo="give a positive epsilon_camera_distances, epsilon_hull_radii or epsilon_world",
             )
-        self.hull, self.epsilon_world = hull, float(epsilon_world)
-        self.interval, self.missing, self.drop_outside = interval, missing, drop_outside
         self._number = torch_ops.enter(self)
 
-    def __setstate__(self, state: dict) -> None:
+    @property
+    def drop_outside(self) -> bool:
+        """Whether `keep` has a say: a method that can shall then ask it about each sample."""
+        return self.config.drop_outside
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._number = torch_ops.enter(self)
 
-    def __call__(self, origins: Tensor, directions: Tensor, near, far) -> RayBounds:
+    def __call__(
+        self, origins: Tensor, directions: Tensor, near: Tensor | float, far: Tensor | float
+    ) -> RayBounds:
         """The same as `bound`."""
         return self.bound(origins, directions, near, far)
 
-    def bound(self, origins: Tensor, directions: Tensor, near, far) -> RayBounds:
+    def bound(
+        self, origins: Tensor, directions: Tensor, near: Tensor | float, far: Tensor | float
+    ) -> RayBounds:
         """Where along each ray samples may be taken. Pure; no gradient.
 
         A ray counts as a hit only when its band overlaps the caller's [near, far].
@@ -135,7 +155,7 @@ class VisDomSampler:
             first = crossing.t_first
             near, far = (_limit(x, first) for x in (near, far))
             far = torch.maximum(far, near)
-            last = first if self.interval == "first_hit" else crossing.t_last
+            last = first if self.config.interval == "first_hit" else crossing.t_last
             epsilon = self.epsilon_world / directions.norm(dim=-1).to(first)
             begin, end = torch.maximum(near, first - epsilon), torch.minimum(far, last + epsilon)
             hit = crossing.hit & (begin < end)
@@ -145,7 +165,7 @@ class VisDomSampler:
                 end = torch.minimum(far.to(half), (end + rounding * end.abs()).to(half))
                 near, far = near.to(half), far.to(half)
             begin = torch.where(hit, begin, near)
-            end = torch.where(hit, end, far if self.missing == "full" else near)
+            end = torch.where(hit, end, far if self.config.missing == "full" else near)
         return RayBounds(begin, end, hit)
 
     def keep(self, points: Tensor) -> Tensor:

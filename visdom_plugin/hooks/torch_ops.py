@@ -7,43 +7,51 @@ this is used, and the compiler is not imported.
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
+from typing import Protocol
 from weakref import WeakValueDictionary
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from visdom_plugin.hooks.sampler import VisDomSampler
+from visdom_plugin.hooks.protocols import SampleFilter, SamplerHook
+
+
+class FilteringSampler(SamplerHook, SampleFilter, Protocol):
+    """What the operators ask."""
+
 
 _numbers = itertools.count()
-_samplers: WeakValueDictionary[int, VisDomSampler] = WeakValueDictionary()
+_samplers: WeakValueDictionary[int, FilteringSampler] = WeakValueDictionary()
 # Operators take tensors and numbers: a sampler goes by its number.
 _library = torch.library.Library("visdom_plugin", "DEF")
 
 
-def enter(sampler: VisDomSampler) -> int:
+def enter(sampler: FilteringSampler) -> int:
     """The number by which operators know this sampler, for as long as it lives in this process."""
     number = next(_numbers)
     _samplers[number] = sampler
     return number
 
 
-def _ray_bounds(origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, sampler: int):
+def _ray_bounds(
+    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, sampler: int
+) -> tuple[Tensor, ...]:
     bounds = _samplers[sampler].bound(origins, directions, near, far)
     return tuple(x.clone() for x in bounds)  # an operator's results may not share memory
 
 
-def _ray_bounds_shapes(origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, sampler: int):
+def _ray_bounds_shapes(
+    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, sampler: int
+) -> tuple[Tensor, ...]:
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
     return *(directions.new_empty(shape) for _ in range(2)), directions.new_empty(shape, dtype=torch.bool)
 
 
-def _keep(points: Tensor, sampler: int):
+def _keep(points: Tensor, sampler: int) -> Tensor:
     return _samplers[sampler].keep(points)
 
 
-def _keep_shape(points: Tensor, sampler: int):
+def _keep_shape(points: Tensor, sampler: int) -> Tensor:
     return points.new_empty(points.shape[:-1], dtype=torch.bool)
 
 

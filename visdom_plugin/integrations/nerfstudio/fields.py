@@ -20,12 +20,14 @@ from torch import Tensor
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import SamplerHook
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.domain import TRAINING_DOMAIN, VisibleDomain
 from visdom_plugin.integrations.nerfstudio.dataparser import METADATA, told
 from visdom_plugin.integrations.nerfstudio.frame import Similarity
 from visdom_plugin.integrations.nerfstudio.pictures import TrainingViews
 from visdom_plugin.integrations.nerfstudio.rays import bound_model_rays
 from visdom_plugin.losses import mask_loss
+
+SAMPLER = SamplerConfig(enabled=True)
 
 
 class HullCollider(SceneCollider):
@@ -133,16 +135,6 @@ class _HullField:
         return losses
 
 
-def default_hull() -> VisibleDomain:
-    """As in our own methods: masks one pixel wider, so that a mask's edge is inside."""
-    return VisibleDomain(dilate_px=1)
-
-
-def default_sampler() -> SamplerConfig:
-    """The hook, switched on."""
-    return SamplerConfig(enabled=True)
-
-
 @dataclass
 class NerfactoVdConfig(NerfactoModelConfig):
     """Nerfacto with rays confined to the visible domain."""
@@ -152,9 +144,9 @@ class NerfactoVdConfig(NerfactoModelConfig):
     """Behind photographs in training; pictures and metrics are on white with "random"."""
     mask_weight: float = 0.1
     """Weight of the cross entropy between opacity and mask."""
-    hull: VisibleDomain = field(default_factory=default_hull)
+    hull: VisibleDomain = TRAINING_DOMAIN
     """How the hull is carved from the training views' masks."""
-    vd: SamplerConfig = field(default_factory=default_sampler)
+    vd: SamplerConfig = SAMPLER
     """The visible-domain hook."""
 
 
@@ -172,9 +164,9 @@ class InstantNgpVdConfig(InstantNGPModelConfig):
     _target: type = field(default_factory=lambda: InstantNgpVd)
     mask_weight: float = 0.1
     """Weight of the cross entropy between opacity and mask."""
-    hull: VisibleDomain = field(default_factory=default_hull)
+    hull: VisibleDomain = TRAINING_DOMAIN
     """How the hull is carved from the training views' masks."""
-    vd: SamplerConfig = field(default_factory=default_sampler)
+    vd: SamplerConfig = SAMPLER
     """The visible-domain hook."""
 
 

@@ -19,9 +19,11 @@ from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.configs import RegularizerConfig
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.domain import TRAINING_DOMAIN, VisibleDomain
 from visdom_plugin.integrations.nerfstudio.dataparser import host_cameras, told
-from visdom_plugin.integrations.nerfstudio.fields import default_hull, known_views, silhouette_loss
+from visdom_plugin.integrations.nerfstudio.fields import known_views, silhouette_loss
+
+REGULARIZER = RegularizerConfig(enabled=True)
 
 
 class Opacity(NamedTuple):
@@ -29,11 +31,6 @@ class Opacity(NamedTuple):
 
     alpha: Tensor
     """(H, W)."""
-
-
-def default_regularizer() -> RegularizerConfig:
-    """The hook, switched on."""
-    return RegularizerConfig(enabled=True)
 
 
 @dataclass
@@ -45,9 +42,9 @@ class SplatfactoVdConfig(SplatfactoModelConfig):
     """Gaussians at the start, drawn from the hull."""
     mask_weight: float = 0.1
     """Weight of the cross entropy between opacity and mask."""
-    hull: VisibleDomain = field(default_factory=default_hull)
+    hull: VisibleDomain = TRAINING_DOMAIN
     """How the hull is carved from the training views' masks."""
-    vd: RegularizerConfig = field(default_factory=default_regularizer)
+    vd: RegularizerConfig = REGULARIZER
     """The visible-domain hook."""
 
 
