@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from tests.training.fake import FASTER, PRESET, FakeConfig, FakeInner
 from visdom_plugin.cli import options
+from visdom_plugin.cli.commands import check, hull
+from visdom_plugin.cli.early import Early, read_early
 from visdom_plugin.errors import ConfigError
 
 
@@ -136,3 +138,27 @@ def test_cuda_where_there_is_none_is_said(monkeypatch):
     assert options.resolve_device("auto") == options.resolve_device("cpu") == "cpu"
     with pytest.raises(ConfigError, match="no CUDA device"):
         options.resolve_device("cuda")
+
+
+def test_one_early_parse_knows_what_decides_the_rest():
+    words = ["--views", "6", "method:a+vd", "--config=a b.yaml", "--device", "cpu", "--device=cuda", "-h"]
+    early = read_early(words)
+    assert early.methods == ("a+vd",) and early.rest == (*words[:2], *words[3:])
+    assert (early.config, early.budget, early.device, early.quiet) == ("a b.yaml", None, "cuda", False)
+    assert early.help and not read_early(words[:-1]).help
+    # An option without its value is left to the real parser.
+    assert read_early(["--quiet", "--config"]) == Early((), ("--quiet", "--config"), quiet=True)
+
+
+@pytest.mark.parametrize("command", [check, hull])
+def test_commands_that_look_at_a_scene_have_the_options_of_training(command, capsys):
+    common = options.SceneOptions.__annotations__.keys() | options.Reading.__annotations__.keys()
+    assert not common & command.Options.__annotations__.keys()
+    with pytest.raises(SystemExit):
+        command.main(["--help"])
+    said = capsys.readouterr().out
+    for name in common:
+        dashed = {"missing_masks": "data.missing-masks", "mask_source": "data.mask-source"}.get(name, name)
+        assert f"--{dashed.replace('_', '-')}" in said
+    assert command.main(["one", "--data", "two"]) == 2
+    assert "two scenes: one and two" in capsys.readouterr().err

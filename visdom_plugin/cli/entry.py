@@ -1,4 +1,4 @@
-"""What every command does about errors, signals and messages."""
+"""Entry of every command: errors become exit statuses, messages go to stderr."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Callable, Sequence
 
+from visdom_plugin.cli.early import read_early
 from visdom_plugin.errors import VisDomError
 
 USER_ERROR, INTERRUPTED = 2, 130
@@ -32,7 +33,7 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
         Any other exception goes on, with a line that calls it a bug.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    set_up_logging(quiet="--quiet" in words)
+    set_up_logging(read_early(words).quiet)
     try:
         return command(words) or 0
     except VisDomError as error:

@@ -9,17 +9,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
 from dataclasses import field as dataclass_field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 
 from datamodules.recognise import FORMATS
 from visdom_plugin import registry
+from visdom_plugin.cli.early import WORD, Early, read_early
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.training.runs.config_io import as_plain, differences, from_plain
 
-WORD = "method:"
-DataFormat = Literal[tuple(FORMATS)]
+if TYPE_CHECKING:
+    DataFormat = str
+else:
+    DataFormat = Literal[tuple(FORMATS)]
+Device = Literal["auto", "cpu", "cuda"]
+Budget = Literal["quick", "full"]
 READING = (
     "views", "downscale", "seed", "missing_masks", "mask_source", "data_format", "train_list", "test_list",
     "frame", "mask_path", "allow_outside",
@@ -46,8 +51,8 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Common(Reading):
-    """Options of every training run."""
+class SceneOptions(Reading):
+    """Options of every command that reads training views."""
 
     data: Path | None = None
     """Folder of the scene; without it, the built-in scene."""
@@ -59,14 +64,42 @@ class Common(Reading):
         "error"
     )
     """Training views without a mask: an error; for colour only, inside the hull of the other views; or that hull's
-    outline becomes their mask. Test views without one are then rendered, not measured."""
+    outline becomes their mask. Test views without one are then rendered, not measured. Commands that do not train
+    leave such views out."""
     mask_source: Annotated[Literal["auto", "folder", "alpha"], tyro.conf.arg(name="data.mask-source")] = (
         "auto"
     )
     """Where masks are read: their folder, the photographs' alpha channel, or whichever there is."""
     seed: int = 0
     """Start of all random numbers."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+@dataclass(frozen=True)
+class FolderOptions(SceneOptions):
+    """Options of the commands that look at a scene and train nothing."""
+
+    folder: tyro.conf.Positional[Path | None] = None
+    """Folder of the scene; without it, the built-in scene."""
+
+    @property
+    def scene_folder(self) -> Path | None:
+        """The scene that was named, in one of two ways.
+
+        Raises:
+            ConfigError: two are named.
+        """
+        if self.folder is not None and self.data is not None and self.folder != self.data:
+            raise ConfigError(f"two scenes: {self.folder} and {self.data}", todo="name one")
+        return self.folder or self.data
+
+
+@dataclass(frozen=True)
+class Common(SceneOptions):
+    """Options of every training run."""
+
+    device: Device = "auto"
     """Where to compute; auto takes CUDA where there is one."""
     budget: Literal["auto", "quick", "full"] = "auto"
     """quick: minutes on two CPU cores; full: the published schedule; auto: quick on CPU, full on CUDA."""
@@ -81,8 +114,6 @@ class Common(Reading):
     """YAML file with settings, as --show-config prints them."""
     show_config: bool = False
     """Print all settings as YAML and stop; no training."""
-    quiet: bool = False
-    """Print nothing but errors."""
 
 
 SAVED = ("data", *READING, "device", "budget")
@@ -116,23 +147,22 @@ def parse(
         ConfigError: for an unknown or missing method, and for everything wrong in the file.
         SystemExit: by tyro, for --help (0) and for unknown options or values (2).
     """
-    words, rest = [a for a in argv if a.startswith(WORD)], [a for a in argv if not a.startswith(WORD)]
-    if len(words) > 1:
-        raise ConfigError(f"one method at a time, please: {' '.join(words)}")
-    file_path = _scan(rest, "config")
-    file, where = ({}, "") if file_path is None else (_read(Path(file_path)), file_path)
-    name = words[0][len(WORD) :] if words else file.get("method")
+    early = read_early(argv)
+    named = name_method(early)
+    file, where = ({}, "") if early.config is None else (_read(Path(early.config)), early.config)
+    name = named or file.get("method")
     if name is None:
-        _without_method(rest, prog)
+        _without_method(early, prog)
     preset = find(str(name))
-    if words and "method" in file and find(str(file["method"])) != preset:
+    if named and "method" in file and find(str(file["method"])) != preset:
         raise ConfigError(
-            f"the file is for method:{file['method']}, the command line says {words[0]}",
+            f"the file is for method:{file['method']}, the command line says {WORD}{named}",
             where=where,
-            todo=f"make one for it: {prog} {words[0]} --show-config > FILE",
+            todo=f"make one for it: {prog} {WORD}{named} --show-config > FILE",
         )
-    asking_help = any(a in ("-h", "--help") for a in rest)
-    budget, note = choose_budget(rest, file, ask_torch=not asking_help)
+    asked = early.budget or file.get("budget", "auto")
+    device = early.device or file.get("device", "auto")
+    budget, note = choose_budget(asked, device, ask_torch=not early.help)
     config = getattr(preset, budget)
     common = Common()
     if file:
@@ -150,11 +180,22 @@ def parse(
         prog=f"{prog} {WORD}{preset.name}",
         description=f"{preset.name}: {preset.description}. Defaults shown: {note}.",
         default=combined(**{f.name: getattr(common, f.name) for f in fields(Common)}, method=config),
-        args=rest,
+        args=early.rest,
         config=(tyro.conf.AvoidSubcommands,),
     )
     common = Common(**{f.name: getattr(parsed, f.name) for f in fields(Common)})
     return Request(preset, parsed.method, replace(common, budget=budget), note)
+
+
+def name_method(early: Early) -> str | None:
+    """The method that the command line names; None where it names none.
+
+    Raises:
+        ConfigError: it names several.
+    """
+    if len(early.methods) > 1:
+        raise ConfigError(f"one method at a time, please: {' '.join(WORD + name for name in early.methods)}")
+    return early.methods[0] if early.methods else None
 
 
 def read_options(options: Any) -> dict[str, Any]:
@@ -185,9 +226,9 @@ def dump(request: Request) -> str:
     return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 
-def _without_method(rest: Sequence[str], prog: str) -> None:
+def _without_method(early: Early, prog: str) -> NoReturn:
     known = registry.installed()
-    if any(a in ("-h", "--help") for a in rest):
+    if early.help:
         lines = [f"{WORD}{p.name}: {p.description}." for p in known.presets.values()]
         tyro.cli(
             Common,
@@ -197,7 +238,7 @@ def _without_method(rest: Sequence[str], prog: str) -> None:
             + f"\n\nSettings of one method: {prog} {WORD}NAME --help",
             args=["--help"],
         )
-    stray = [a for a in rest if a in known.presets or a in known.aliases]
+    stray = [a for a in early.rest if a in known.presets or a in known.aliases]
     if stray:
         raise ConfigError(f"a method is named with {WORD} before it", todo=f"{prog} {WORD}{stray[0]}")
     raise ConfigError(
@@ -206,33 +247,20 @@ def _without_method(rest: Sequence[str], prog: str) -> None:
     )
 
 
-def _scan(argv: Sequence[str], option: str) -> str | None:
-    """The last value of an option, found before the real parser knows its defaults."""
-    value = None
-    for i, word in enumerate(argv):
-        if word == f"--{option}" and i + 1 < len(argv):
-            value = argv[i + 1]
-        elif word.startswith(f"--{option}="):
-            value = word.partition("=")[2]
-    return value
-
-
-def choose_budget(rest: Sequence[str], file: dict[str, Any], ask_torch: bool = True) -> tuple[str, str]:
-    """ "quick" or "full", and why, from the command line's words and a config file's entries.
+def choose_budget(budget: str, device: str, ask_torch: bool = True) -> tuple[Budget, str]:
+    """ "quick" or "full", and why, from the options --budget and --device.
 
     Without `ask_torch`, a driver is taken for a CUDA device.
     """
-    budget = _scan(rest, "budget") or file.get("budget", "auto")
-    if budget in ("quick", "full"):
+    if budget == "quick" or budget == "full":
         return budget, f"budget {budget}"
-    device = _scan(rest, "device") or file.get("device", "auto")
     # Help must not wait for torch: without a driver there is no CUDA, and with one it is the likely case.
     if device == "auto":
         device = "cuda" if Path("/dev/nvidiactl").exists() else "cpu"
         if device == "cuda" and ask_torch:
             device = resolve_device("auto")
-    budget = "full" if device == "cuda" else "quick"
-    return budget, f"budget {budget}, chosen for device {device}"
+    chosen: Budget = "full" if device == "cuda" else "quick"
+    return chosen, f"budget {chosen}, chosen for device {device}"
 
 
 def resolve_device(device: str) -> str:

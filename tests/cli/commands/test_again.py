@@ -16,7 +16,7 @@ from tests.datamodules.layouts import test_layouts as layouts
 from tests.datamodules.layouts.layout_writers import write_colmap
 from tests.training import fake
 from visdom_plugin import registry
-from visdom_plugin.cli import scenes
+from visdom_plugin.cli import runs
 from visdom_plugin.cli.commands import evaluate, render, train
 from visdom_plugin.errors import CheckpointError
 from visdom_plugin.scene import hold_out
@@ -134,13 +134,13 @@ def test_every_layout_gives_the_noted_views_again(name, held_out, free, plain, t
     if held_out:
         scene = hold_out(scene, 2)
     noted = describe_data(scene, {"path": str(path), **asked})
-    again = scenes.load_again({"data": json.loads(json.dumps(noted))}, tmp_path, None)
+    again = runs.load_again({"data": json.loads(json.dumps(noted))}, tmp_path, None)
     for part in ("train", "test"):
         assert list(getattr(again, part).names) == noted[part] and (noted[part] or part == "test")
     if noted["test"]:
         noted["test"] = noted["test"][1:] or [noted["train"].pop()]
         with pytest.raises(CheckpointError, match="is not the one this run was"):
-            scenes.load_again({"data": noted}, tmp_path, None)
+            runs.load_again({"data": noted}, tmp_path, None)
 
 
 def test_a_single_view_and_names_with_commas(folder, capsys):

@@ -12,7 +12,7 @@ import cv2
 import pytest
 
 from tests.training import fake
-from visdom_plugin.cli import entry, scenes
+from visdom_plugin.cli import entry, runs
 from visdom_plugin.cli.commands import evaluate, methods, render, train
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.scene import Views
@@ -96,7 +96,7 @@ def test_eval_of_changed_data_is_refused(trained, capsys, monkeypatch):
     record = json.loads((trained / "run.json").read_text())
     record["data"]["path"] = "/gone"
     with pytest.raises(Exception, match="--data DIR"):
-        scenes.load_again(record, trained, None)
+        runs.load_again(record, trained, None)
 
 
 @pytest.mark.parametrize("command", [evaluate.main, render.main])

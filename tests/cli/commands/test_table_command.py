@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from method_configs.not_built import NOT_BUILT
 from visdom_plugin import registry
 from visdom_plugin.cli.commands import table
+from visdom_plugin.cli.table_parts import run_table
+from visdom_plugin.cli.table_parts.workshop import make_workshop
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.tables.report.write import write_all
 from visdom_plugin.tables.results import Results
@@ -117,7 +119,7 @@ def test_two_real_runs_make_a_table_and_are_used_again(small, tmp_path, capsys):
 @pytest.mark.slow
 def test_a_run_that_fails_is_quoted_and_the_command_says_so(small, tmp_path, capsys):
     (tmp_path / "empty").mkdir()
-    assert table.main([str(small), "--out", "t", "--data", "empty", "--only", "Bare"]) == table.FAILURES
+    assert table.main([str(small), "--out", "t", "--data", "empty", "--only", "Bare"]) == run_table.FAILURES
     said = capsys.readouterr()
     assert "failed: Bare, empty, 4 views, seed 0" in said.err and "--retry" in said.err
     (note,) = (tmp_path / "t/runs").glob("*.error.json")
@@ -193,7 +195,7 @@ def test_a_tables_mistake_ends_with_2_before_anything_runs(small, tmp_path, caps
 
 
 def _resolve(name: str) -> Any:
-    return table.make_workshop(table.Options(device="cpu")).resolve("train", name, "quick")
+    return make_workshop("cpu").resolve("train", name, "quick")
 
 
 def test_a_misspelt_method_is_an_error_with_the_right_one():
@@ -249,7 +251,7 @@ def test_whatever_stands_in_a_table_it_is_a_table_or_a_clear_error(tmp_path, pla
         try:
             list_editions(file)
             spec = load_table(file, edition)
-            table.run_spec(spec, table.Options(dry_run=True, device="cpu", out=tmp_path / "t"))
+            run_table.run_spec(spec, run_table.TableOptions(dry_run=True, device="cpu", out=tmp_path / "t"))
         except ConfigError as error:
             assert error.what
         else:

@@ -16,6 +16,7 @@ from visdom_plugin import registry
 from visdom_plugin.cli.commands import table
 from visdom_plugin.cli.table_parts.ablation import NAMED, VARIANTS, AblationOptions, make_spec
 from visdom_plugin.cli.table_parts.ablation_figure import draw_figure
+from visdom_plugin.cli.table_parts.workshop import make_workshop
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.tables.results import Job, Outcome, Results
@@ -49,7 +50,7 @@ def variants(fakes, monkeypatch):
 def _resolved(method: str, **options):
     given = AblationOptions(table="ablation", budget="quick", device="cpu", **options)
     spec = make_spec(method, given)
-    made = plan(spec, Path("runs"), table.make_workshop(given))
+    made = plan(spec, Path("runs"), make_workshop(given.device))
     settings = {}
     for job in made.jobs:
         settings[spec.rows[job.row].label] = made.tasks[job.run_dir].content

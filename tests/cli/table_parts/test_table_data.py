@@ -9,9 +9,9 @@ import pytest
 from datamodules.synthetic.scene import SyntheticConfig, make_scene
 from tests.datamodules.layouts.layout_writers import join, write_colmap
 from tests.datamodules.layouts.prepared_writer import write_prepared
-from visdom_plugin.cli.commands.table import Options, make_workshop
 from visdom_plugin.cli.options import READING
 from visdom_plugin.cli.table_parts.table_data import OWN, DataHasher, tidy_reading
+from visdom_plugin.cli.table_parts.workshop import make_workshop
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.tables.run.jobs import plan
 from visdom_plugin.tables.spec import parse_table
@@ -34,7 +34,7 @@ def _plan(root: Path, kind: str = "train", settings=None, **column):
     row = {"label": "A", "method": "hull" if kind == "hull" else "ingp+vd", "settings": settings or {}}
     column = {"label": "c", "root": "mine", "scenes": ["thing"], **column}
     spec = parse_table({"kind": kind, "rows": [row], "columns": [column], "budget": "quick"}, "t", "t.yaml")
-    return plan(spec, Path("runs"), make_workshop(Options(device="cpu")), {"mine": root})
+    return plan(spec, Path("runs"), make_workshop("cpu"), {"mine": root})
 
 
 def _run(*given, **column) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from visdom_plugin.cli.entry import run
-from visdom_plugin.cli.options import Reading, read_options
+from visdom_plugin.cli.options import FolderOptions, read_options
 from visdom_plugin.errors import ConfigError, SceneError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ FOUND = 1
 
 
 @dataclass(frozen=True)
-class Options(Reading):
+class Options(FolderOptions):
     """Check cameras, masks and photographs of a scene.
 
     Finds masks that are inverted, empty, full, cut off, speckled, doubled or of the wrong size; poses with wrong
@@ -35,32 +35,12 @@ class Options(Reading):
     findings, 2 when the scene cannot be read.
     """
 
-    folder: tyro.conf.Positional[Path | None] = None
-    """Folder of the scene; without it, the built-in scene."""
-    data: Path | None = None
-    """The same as the positional argument."""
-    views: int = 4
-    """Training views."""
-    downscale: float = 1.0
-    """Work on images smaller by this factor."""
-    seed: int = 0
-    """Of the built-in scene."""
     k: Annotated[int | Literal["auto"], tyro.conf.arg(aliases=["-k"])] = "auto"
     """The K you are going to use; auto has one advised."""
-    missing_masks: Annotated[Literal["error", "colour", "hull"], tyro.conf.arg(name="data.missing-masks")] = (
-        "error"
-    )
-    """Training views without a mask: an error, or left out of the check (colour and hull alike)."""
-    mask_source: Annotated[Literal["auto", "folder", "alpha"], tyro.conf.arg(name="data.mask-source")] = (
-        "auto"
-    )
-    """Where masks are read: their folder, the photographs' alpha channel, or whichever there is."""
     out: Path | None = None
     """Folder for the contact sheet (check.png) and the report (check.json)."""
     json: bool = False
     """Print one JSON object instead of the table."""
-    quiet: bool = False
-    """Print nothing but errors; the exit status tells."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -70,13 +50,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(argv: Sequence[str]) -> int:
     options = tyro.cli(Options, args=list(argv), prog="visdom-check")
-    if options.folder is not None and options.data is not None and options.folder != options.data:
-        raise ConfigError(f"two scenes: {options.folder} and {options.data}", todo="name one")
+    folder = options.scene_folder
     if options.k != "auto" and options.k < 1:
         raise ConfigError(f"k is {options.k}", where="-k", todo="use a whole number from 1, or auto")
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         raise ConfigError("this is a file, not a folder", where=f"--out {options.out}", todo="name a folder")
-    folder = options.folder or options.data
     started = time.perf_counter()
     from visdom_plugin.cli.scenes import open_scene
 

@@ -11,6 +11,7 @@ from typing import Literal
 import tyro
 
 from visdom_plugin.cli import entry
+from visdom_plugin.cli.early import read_early
 
 
 @dataclass(frozen=True)
@@ -37,14 +38,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _evaluate(argv: Sequence[str]) -> int:
-    if "--leave-one-out" in argv:
+    if read_early(argv).leave_one_out:
         from visdom_plugin.cli.evaluation.leave_one_out import leave_one_out
 
         return leave_one_out([word for word in argv if word != "--leave-one-out"])
     options = tyro.cli(Options, args=argv, prog="visdom-eval")
 
     from visdom_plugin.cli.report import say, show_result
-    from visdom_plugin.cli.scenes import open_run
+    from visdom_plugin.cli.runs import open_run
     from visdom_plugin.training.run import evaluate_again
 
     record, config, scene, method, hull, device, step = open_run(options.run, options.data, options.device)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from visdom_plugin.cli.entry import run
-from visdom_plugin.cli.options import Reading, read_options
+from visdom_plugin.cli.options import FolderOptions, read_options
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.settings import Box
@@ -21,22 +21,12 @@ _DEFAULT = VisibleDomain()
 
 
 @dataclass(frozen=True)
-class Options(Reading):
+class Options(FolderOptions):
     """Carve the visible-domain hull of a scene from its cameras and masks.
 
     Prints what it measured; --out writes the mesh (.ply) or the voxel grid (.npz).
     """
 
-    folder: tyro.conf.Positional[Path | None] = None
-    """Folder of the scene; without it, the built-in scene."""
-    data: Path | None = None
-    """The same as the positional argument."""
-    views: int = 4
-    """Training views; the hull sees no others."""
-    downscale: float = 1.0
-    """Work on images smaller by this factor."""
-    seed: int = 0
-    """Of the built-in scene."""
     k: Annotated[int | Literal["n-1", "auto"], tyro.conf.arg(aliases=["-k"])] = _DEFAULT.k
     """Fewest views that must see a voxel."""
     agreement: float = _DEFAULT.agreement
@@ -59,14 +49,6 @@ class Options(Reading):
     """Centre of the ball of --kind unit-sphere, world units."""
     sphere_radius: float | None = None
     """Radius of that ball."""
-    missing_masks: Annotated[Literal["error", "colour", "hull"], tyro.conf.arg(name="data.missing-masks")] = (
-        "error"
-    )
-    """Training views without a mask: an error, or left out of the carving (colour and hull alike)."""
-    mask_source: Annotated[Literal["auto", "folder", "alpha"], tyro.conf.arg(name="data.mask-source")] = (
-        "auto"
-    )
-    """Where masks are read: their folder, the photographs' alpha channel, or whichever there is."""
     out: Path | None = None
     """File to write: .ply for the mesh, .npz for the grid."""
     masks_out: Path | None = None
@@ -81,8 +63,6 @@ class Options(Reading):
     """Print one JSON object instead of the table."""
     diagnose: bool = False
     """Look for what is wrong: the view that disagrees, masks that touch the border, what each K leaves."""
-    quiet: bool = False
-    """Print nothing but errors."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -92,8 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(argv: Sequence[str]) -> None:
     options = tyro.cli(Options, args=list(argv), prog="visdom-hull")
-    if options.folder is not None and options.data is not None and options.folder != options.data:
-        raise ConfigError(f"two scenes: {options.folder} and {options.data}", todo="name one")
+    folder = options.scene_folder
     if options.out is not None and options.out.suffix not in (".ply", ".npz"):
         raise ConfigError(
             f"cannot write {options.out.name}",
@@ -110,7 +89,7 @@ def _main(argv: Sequence[str]) -> None:
     if options.masks_out is not None:
         masks = MaskRequest(options.masks_out, options.cameras, options.frames, options.overwrite)
     scene = open_scene(
-        options.folder or options.data,
+        folder,
         **read_options(options),
         fill=False,
         test=masks is not None and masks.cameras == "test",

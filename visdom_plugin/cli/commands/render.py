@@ -57,7 +57,7 @@ def _render(argv: Sequence[str]) -> None:
         )
 
     from visdom_plugin.cli.report import say
-    from visdom_plugin.cli.scenes import open_run
+    from visdom_plugin.cli.runs import open_run
     from visdom_plugin.figures.contact_sheet import to_bytes, write_png, write_video
     from visdom_plugin.training.evaluate import render_on_white
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 from visdom_plugin.cli import entry, options
 
@@ -26,6 +23,7 @@ def _train(argv: Sequence[str]) -> None:
 
     from visdom_plugin.cli.commands.check import warn_of_faults
     from visdom_plugin.cli.report import say, show_result
+    from visdom_plugin.cli.runs import default_run_dir, train_as_asked
     from visdom_plugin.cli.scenes import open_scene
     from visdom_plugin.scene import describe_masks
 
@@ -47,34 +45,6 @@ def _train(argv: Sequence[str]) -> None:
         elif record["resumed_from"] is not None:
             say(f"resumed after step {record['resumed_from']}")
         show_result(record, folder)
-
-
-def train_as_asked(request: options.Request, scene, run_dir: Path, device: str) -> dict[str, Any]:
-    """`training.run.train` with what the command line says; run.json's content."""
-    from visdom_plugin.cli.scenes import make_data_manager
-    from visdom_plugin.training.run import train
-
-    common = request.common
-    return train(
-        request.preset.name,
-        request.config,
-        scene,
-        data_manager=make_data_manager,
-        run_dir=run_dir,
-        device=device,
-        seed=common.seed,
-        quiet=common.quiet,
-        overwrite=common.overwrite,
-        checkpoint_seconds=common.checkpoint_seconds,
-        budget=common.budget,
-        request=options.describe_reading(common),
-    )
-
-
-def default_run_dir(scene: str, views: int, method: str, seed: int) -> Path:
-    """runs/<scene>/<views>/<method>/<seed>, below the working directory."""
-    safe = re.sub(r"[^\w.+-]+", "_", scene).strip(".") or "scene"
-    return Path("runs") / safe / str(views) / method / str(seed)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from visdom_plugin.cli import options
+from visdom_plugin.cli.early import WORD, read_early
 from visdom_plugin.errors import ConfigError, EmptyHullError, SceneError
 
 log = logging.getLogger(__name__)
@@ -38,11 +39,9 @@ PROG = "visdom-eval --leave-one-out"
 
 def leave_one_out(argv: Sequence[str]) -> int:
     """The command; returns the exit status."""
-    argv = list(argv)
-    named = any(word.startswith((options.WORD, "--config")) for word in argv)
-    if not named:
-        argv.append(options.WORD + DEFAULT_METHOD)
-    request = options.parse(argv, prog=PROG)
+    early = read_early(argv)
+    named = bool(early.methods or early.config)
+    request = options.parse(argv if named else [*argv, WORD + DEFAULT_METHOD], prog=PROG)
     common = request.common
     if common.show_config:
         sys.stdout.write(options.dump(request))
@@ -70,7 +69,7 @@ def leave_one_out(argv: Sequence[str]) -> int:
 
 def default_folder(scene: Any, method: str, seed: int) -> Path:
     """runs/<scene>/<views>/<method>/<seed>-leave-one-out."""
-    from visdom_plugin.cli.commands.train import default_run_dir
+    from visdom_plugin.cli.runs import default_run_dir
 
     return default_run_dir(scene.name, len(scene.train), method, seed).with_name(f"{seed}-leave-one-out")
 
@@ -130,8 +129,8 @@ def run_folds(request: options.Request, scene: Any, folder: Path, *, device: str
         ConfigError, CheckpointError, PluginError: settings, folder or method will not do, with or without a view.
     """
     from visdom_plugin.atomic_files import write_json
-    from visdom_plugin.cli.commands.train import train_as_asked
     from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.runs import train_as_asked
     from visdom_plugin.figures.contact_sheet import picture_names, write_png
     from visdom_plugin.scene import hold_out
     from visdom_plugin.training.missing_masks import fill_masks

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from visdom_plugin import registry
 from visdom_plugin.cli import entry, options
+from visdom_plugin.cli.early import WORD
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.training.hull_run.config import METHOD, HullRunConfig
 
@@ -41,15 +42,15 @@ def find(name: str) -> registry.Preset:
 
 
 def _measure(argv: Sequence[str]) -> None:
-    words = [*argv, options.WORD + METHOD]
+    words = [*argv, WORD + METHOD]
     request = options.parse(words, prog="python -m visdom_plugin.cli.hulls.measure_hull", find=find)
     common = request.common
     if common.show_config:
         sys.stdout.write(options.dump(request))
         return
 
-    from visdom_plugin.cli.commands.train import default_run_dir
     from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.runs import default_run_dir
     from visdom_plugin.cli.scenes import open_scene
     from visdom_plugin.training.hull_run.run import carve_run
 

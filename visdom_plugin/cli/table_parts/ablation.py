@@ -14,8 +14,15 @@ from typing import Any
 
 import tyro
 
-from visdom_plugin.cli.commands.table import Options, change_spec, find_folders, find_rows, run_spec
-from visdom_plugin.cli.options import WORD
+from visdom_plugin.cli.early import WORD, read_early
+from visdom_plugin.cli.options import Common, Request, choose_budget, name_method, resolve_device
+from visdom_plugin.cli.table_parts.run_table import (
+    TableOptions,
+    change_spec,
+    find_folders,
+    find_rows,
+    run_spec,
+)
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.tables.results import Job, Outcome, Results
 from visdom_plugin.tables.spec import Column, Row, TableSpec, flatten, nest
@@ -39,7 +46,7 @@ VIEWS_SHOWN = 3
 
 
 @dataclass(frozen=True)
-class AblationOptions(Options):
+class AblationOptions(TableOptions):
     """Paired ablation of one method (method:NAME, by default ingp) on your own scene.
 
     Vanilla, with the mask loss, and with the hook in the traditional hull within a ball, the whole traditional
@@ -56,21 +63,18 @@ class AblationOptions(Options):
 
 def ablation(argv: Sequence[str]) -> int:
     """The command; returns the exit status."""
-    words = [word for word in argv if word.startswith(WORD)]
-    rest = [word for word in argv if not word.startswith(WORD)]
-    if len(words) > 1:
-        raise ConfigError(f"one method at a time, please: {' '.join(words)}")
-    options = tyro.cli(AblationOptions, args=rest, prog=f"visdom-table {NAME} [{WORD}{DEFAULT_METHOD}]")
+    early = read_early(argv)
+    named = name_method(early)
+    options = tyro.cli(AblationOptions, args=early.rest, prog=f"visdom-table {NAME} [{WORD}{DEFAULT_METHOD}]")
     if options.table not in (None, NAME):
         raise ConfigError(
-            f"{words[0]} goes with the table {NAME!r} alone, not with {options.table!r}",
+            f"{WORD}{named} goes with the table {NAME!r} alone, not with {options.table!r}",
             where="the command line",
-            todo=f"leave out {words[0]}, or make the {NAME}: visdom-table {NAME} {words[0]}",
+            todo=f"leave out {WORD}{named}, or make the {NAME}: visdom-table {NAME} {WORD}{named}",
         )
     if options.edition is not None:
         raise ConfigError(f"the {NAME} has no editions", where=f"--edition {options.edition}")
-    method = words[0][len(WORD) :] if words else DEFAULT_METHOD
-    spec = make_spec(method, options)
+    spec = make_spec(named or DEFAULT_METHOD, options)
     out, runs = find_folders(spec, options)
     options = replace(options, out=out, runs=runs)
     scene = _open(spec, options)
@@ -165,7 +169,6 @@ def _open(spec: TableSpec, options: AblationOptions) -> Any:
 def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
     """The same table with every training view held out in turn; the views stand as the table's scenes."""
     from visdom_plugin.cli.evaluation import leave_one_out as folds
-    from visdom_plugin.cli.options import Common, Request, choose_budget, resolve_device
     from visdom_plugin.cli.report import say
     from visdom_plugin.tables.report.write import write_all
     from visdom_plugin.training.runs.run_directory import read_record
@@ -177,7 +180,7 @@ def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
             "--leave-one-out goes with one number of views, one seed and this process",
             todo="leave out --executor, --workers and --dry-run, and give one --views and --seeds",
         )
-    budget, note = choose_budget([f"--budget={spec.budget}", f"--device={options.device}"], {})
+    budget, note = choose_budget(spec.budget, options.device)
     common = Common(
         data=options.data,
         views=column.views[0],

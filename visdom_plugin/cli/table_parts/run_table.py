@@ -1,0 +1,235 @@
+"""Running a table as the command line asks: what it changes of the file, where the runs go, who runs them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.tables.results import Results
+from visdom_plugin.tables.spec import Column, TableSpec, check_spec
+
+if TYPE_CHECKING:
+    from visdom_plugin.tables.run.executors import Executor
+    from visdom_plugin.tables.run.jobs import Plan
+
+FAILURES = 1
+"""Exit status of a table with failed runs."""
+
+
+@dataclass(frozen=True)
+class TableOptions:
+    """Run a table: every row (method) on every scene and number of views of every column, once per seed.
+
+    Finished runs are reused, interrupted ones go on, failed ones keep their error in the table and do not stop the
+    rest. Writes table.md, .csv, .tex and .html whenever a run ends. Exits with 1 when runs failed.
+
+    The table `ablation` is made for one method and your scene: visdom-table ablation method:ingp --data DIR
+    """
+
+    table: tyro.conf.Positional[str | None] = None
+    """Name of a shipped table or a YAML file, with `:EDITION` where wanted; without it, the shipped ones are
+    listed."""
+    edition: str | None = None
+    """Edition of the table, e.g. smoke."""
+    out: Path | None = None
+    """Folder of the table; by default tables/<name>, or tables/<name>-<edition>."""
+    runs: Path | None = None
+    """Folder of run directories; by default `runs` in the table's folder. Tables with the same one share
+    their runs."""
+    root: tuple[str, ...] = ()
+    """Where data lie, as NAME=DIR for each root the table names; or set VISDOM_ROOT_<NAME>."""
+    data: Path | None = None
+    """Run the rows on this scene in place of the table's columns."""
+    views: tuple[int, ...] = ()
+    """Numbers of training views in place of the table's."""
+    downscale: float | None = None
+    """In place of the table's."""
+    seeds: tuple[int, ...] = ()
+    """In place of the table's."""
+    only: tuple[str, ...] = ()
+    """Labels of the rows to run; the others show what there is."""
+    budget: Literal["auto", "quick", "full"] | None = None
+    """In place of the table's."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; auto takes CUDA where there is one."""
+    executor: Literal["process", "local", "slurm"] | None = None
+    """This process; `--workers` processes of this machine (the default with --workers); or a Slurm cluster."""
+    workers: int | None = None
+    """Runs at a time on this machine; its cores are divided among them."""
+    slurm: Path | None = None
+    """YAML file of Slurm's resources; its entries win over the table's `slurm:`."""
+    retry: bool = False
+    """Try failed runs again."""
+    dry_run: bool = False
+    """List the runs and what is there already, and stop."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | None]:
+    """Runs a table as the options say.
+
+    Returns:
+        the exit status, and what there is of the runs; None in place of it when they were only listed.
+    """
+    from visdom_plugin.cli.table_parts.workshop import make_workshop
+    from visdom_plugin.tables.report.summary import summarise
+    from visdom_plugin.tables.report.write import write_all
+    from visdom_plugin.tables.run.driver import gather, look, run_plan
+    from visdom_plugin.tables.run.job_files import remove_old_parts
+    from visdom_plugin.tables.run.jobs import plan
+    from visdom_plugin.tables.run.progress import Overview
+
+    only = find_rows(spec, options.only)
+    folder, runs = find_folders(spec, options)
+    # Refuses metrics, layouts and places in the paper that are not there.
+    summarise(Results(spec))
+    made = plan(spec, runs, make_workshop(options.device, options.executor), _read_roots(options))
+    overview = Overview(quiet=options.quiet)
+    executor = _make_executor(spec, options, runs, overview.tick)
+    if options.dry_run:
+        sys.stdout.write("\n".join(describe_plan(made)) + "\n")
+        return 0, None
+    for place in (folder, runs):
+        _make_folder(place)
+        remove_old_parts(place)
+    run_plan(
+        made,
+        executor,
+        lambda results: write_all(results, folder),
+        retry=options.retry,
+        only=only,
+        overview=overview,
+    )
+    results = gather(made, look(made))
+    failed = sum(outcome.status == "failed" for outcome in results.outcomes.values())
+    if not options.quiet:
+        from visdom_plugin.cli.report import say
+
+        markdown = folder / "table.md"
+        if markdown.exists():
+            sys.stdout.write(markdown.read_text(encoding="utf-8"))
+        if failed:
+            say(
+                f"{failed} of {len(results.outcomes)} runs failed; the same command with --retry tries them again"
+            )
+        for path in sorted(folder.glob("table*.*")):
+            say(f"written: {path}")
+    return FAILURES if failed else 0, results
+
+
+def find_rows(spec: TableSpec, labels: Sequence[str]) -> list[int] | None:
+    """Positions of the rows that --only names; None where it names none, which is all of them.
+
+    Raises:
+        ConfigError: for a row that is not there.
+    """
+    known = [row.label for row in spec.rows]
+    for label in labels:
+        if label not in known:
+            raise ConfigError(f"there is no row {label!r}", where="--only", todo=f"rows: {', '.join(known)}")
+    return [known.index(label) for label in labels] or None
+
+
+def find_folders(spec: TableSpec, options: TableOptions) -> tuple[Path, Path]:
+    """The table's folder and that of its runs, neither of which need be there yet.
+
+    Raises:
+        ConfigError: when one of them is a file, or would lie below one.
+    """
+    folder = options.out or Path("tables") / spec.folder_name
+    runs = options.runs or folder / "runs"
+    for what, option, path in (("table", "--out", folder), ("runs", "--runs", runs)):
+        for place in (path, *path.parents):
+            if place.exists() and not place.is_dir():
+                said = "is a file" if place == path else f"cannot be made: {place} is a file"
+                raise ConfigError(
+                    f"the folder of the {what} {said}", where=path, todo=f"choose another {option}"
+                )
+    return folder, runs
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"the folder cannot be made: {error.strerror}", where=path, todo="choose another --out or --runs"
+        ) from error
+
+
+def change_spec(spec: TableSpec, options: TableOptions) -> TableSpec:
+    """The table with what the command line puts in its place."""
+    columns = spec.columns
+    if options.data is not None:
+        if not options.data.expanduser().is_dir():
+            raise ConfigError(f"there is no folder {options.data}", where="--data")
+        views = options.views or columns[0].views
+        columns = (Column(options.data.resolve().name, "data", (".",), views),)
+    if options.views:
+        columns = tuple(replace(column, views=options.views) for column in columns)
+    if options.downscale is not None:
+        columns = tuple(replace(column, downscale=options.downscale) for column in columns)
+    changed = replace(
+        spec, columns=columns, seeds=options.seeds or spec.seeds, budget=options.budget or spec.budget
+    )
+    check_spec(changed, "the command line")
+    return changed
+
+
+def describe_plan(made: Plan) -> list[str]:
+    """One line per job: what would become of it."""
+    from visdom_plugin.tables.run.driver import gather, look
+    from visdom_plugin.tables.run.job_files import is_held, read_step
+
+    lines, seen = [], set()
+    for job, outcome in gather(made, look(made)).outcomes.items():
+        word = {"finished": "reuse", "waiting": "run"}.get(outcome.status, outcome.status)
+        if job.run_dir is not None:
+            if job.run_dir in seen:
+                word = "shared"
+            elif outcome.status == "waiting" and is_held(job.run_dir):
+                word = "running"
+            elif outcome.status == "waiting" and (step := read_step(job.run_dir)):
+                word = f"resume from {step}"
+            seen.add(job.run_dir)
+        row, column = made.spec.rows[job.row], made.spec.columns[job.column]
+        where = "" if job.run_dir is None else f"  {job.run_dir}"
+        lines.append(
+            f"{word:<16} {row.label} | {column.label} | {job.scene} | {job.views} | {job.seed}{where}"
+        )
+    todo = len(made.tasks) - sum(o.status == "finished" for o in look(made).values())
+    return [*lines, f"{len(lines)} jobs, {len(made.tasks)} runs, {todo} of them not finished"]
+
+
+def _read_roots(options: TableOptions) -> dict[str, Path]:
+    roots = {}
+    for text in options.root:
+        name, equals, folder = text.partition("=")
+        if not (name and equals and folder):
+            raise ConfigError(f"--root {text} is not NAME=DIR", todo="e.g. --root mip360=/data/mip360")
+        roots[name] = Path(folder)
+    if options.data is not None:
+        roots["data"] = options.data
+    return roots
+
+
+def _make_executor(spec: TableSpec, options: TableOptions, runs: Path, tick: Callable[[], None]) -> Executor:
+    from visdom_plugin.tables.run.executors import Here, Local
+    from visdom_plugin.tables.run.slurm import Slurm, read_config
+
+    kind = options.executor or ("process" if options.workers is None else "local")
+    if options.workers is not None and kind != "local":
+        raise ConfigError(f"--workers {options.workers} does not go with the executor {kind!r}")
+    if options.workers is not None and options.workers < 1:
+        raise ConfigError(f"--workers is {options.workers}; it must be 1 or more")
+    resources = read_config(spec, options.slurm)
+    if kind == "process":
+        return Here(tick)
+    return Local(options.workers or 1) if kind == "local" else Slurm(resources, runs)
