@@ -6,6 +6,17 @@ Names are imported when they are first used, so that commands answer `--help` wi
 from __future__ import annotations
 
 from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .errors import EmptyHullError, VisDomError
+    from .geometry.cameras import Cameras, Rays
+    from .hooks.regularizer import VisDomGaussianRegularizer
+    from .hooks.sampler import VisDomSampler
+    from .hull.domain import VisibleDomain
+    from .hull.hull import Hull
+    from .render import Render
+    from .scene import Scene, Views
 
 __version__ = "0.1.0"
 
@@ -23,13 +34,28 @@ _HOME = {
     "VisDomGaussianRegularizer": "visdom_plugin.hooks.regularizer",
 }
 
-__all__ = ["__version__", *_HOME]
+__all__ = [
+    "Cameras",
+    "EmptyHullError",
+    "Hull",
+    "Rays",
+    "Render",
+    "Scene",
+    "Views",
+    "VisDomError",
+    "VisDomGaussianRegularizer",
+    "VisDomSampler",
+    "VisibleDomain",
+    "__version__",
+]
 
 
-def __getattr__(name: str):
-    if name in _HOME:
-        return getattr(import_module(_HOME[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if not TYPE_CHECKING:  # a type checker would take any name for a public one
+
+    def __getattr__(name: str) -> object:
+        if name in _HOME:
+            return getattr(import_module(_HOME[name]), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -1,0 +1,50 @@
+"""A trainer's use of the public names, every value with the type that a type checker must find for it."""
+
+import numpy as np
+from torch import Tensor
+from typing_extensions import assert_type
+
+from visdom_plugin import (
+    Cameras,
+    EmptyHullError,
+    Hull,
+    Rays,
+    Render,
+    Scene,
+    Views,
+    VisDomError,
+    VisDomGaussianRegularizer,
+    VisDomSampler,
+    VisibleDomain,
+)
+from visdom_plugin.losses import mask_loss
+
+
+def carve(K: np.ndarray, motion: np.ndarray, masks: list[Tensor]) -> Hull:
+    cameras = Cameras.from_matrices(K, motion, width=64, height=48, convention="opencv")
+    assert_type(cameras, Cameras)
+    try:
+        return VisibleDomain(k=3).carve(cameras, masks)
+    except EmptyHullError as error:
+        refused: VisDomError = error
+        raise refused from None
+
+
+def bound(hull: Hull, rays: Rays) -> Tensor:
+    near, far, hit = VisDomSampler(hull)(rays.origins, rays.directions, 0.0, 9.0)
+    assert_type(near, Tensor)
+    assert_type(hit, Tensor)
+    return far - near
+
+
+def regularise(hull: Hull, views: Views, render: Render) -> Tensor:
+    hook = VisDomGaussianRegularizer(hull, views.cameras)
+    xyz, rgb = hook.initial_points(20_000)
+    assert_type(rgb, Tensor)
+    losses = hook.loss(lambda camera: render)
+    assert_type(losses, dict[str, Tensor])
+    return xyz.sum() + mask_loss(render.alpha, render.alpha) + sum(losses.values())
+
+
+def test_cameras(scene: Scene) -> Cameras:
+    return scene.test.cameras
