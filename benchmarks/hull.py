@@ -19,7 +19,8 @@ import time
 import numpy as np
 import torch
 
-from visdom_plugin.geometry.cameras import Cameras, look_at_camera, project
+from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.cameras import Cameras, project
 from visdom_plugin.hull.carving.keep_rule import KeepRule, as_fraction
 from visdom_plugin.hull.carving.octree import block_carve
 from visdom_plugin.hull.carving.votes import Grid, dense_carve, gather_silhouettes

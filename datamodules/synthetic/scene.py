@@ -184,7 +184,8 @@ def _rows(config: SyntheticConfig) -> list[tuple]:
 def _camera(config: SyntheticConfig, row: tuple):
     import torch
 
-    from visdom_plugin.geometry.cameras import Cameras, look_at_camera
+    from visdom_plugin.geometry.camera_paths import look_at_camera
+    from visdom_plugin.geometry.cameras import Cameras
 
     azimuth, elevation, distance, view, right, up, shift_x, shift_y = row
     azimuth, elevation = math.radians(azimuth), math.radians(elevation)

@@ -9,15 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from visdom_plugin.errors import SceneError
-from visdom_plugin.geometry.cameras import (
-    Cameras,
-    interpolate,
-    look_at_camera,
-    look_at_point,
-    orbit,
-    project,
-    rays_of,
-)
+from visdom_plugin.geometry.camera_paths import interpolate, look_at_camera, orbit
+from visdom_plugin.geometry.cameras import Cameras, look_at_point, project, rays_of
 from visdom_plugin.geometry.rotations import matrix_from_quaternion
 
 

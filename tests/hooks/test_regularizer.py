@@ -9,7 +9,8 @@ import torch
 
 from visdom_plugin import Cameras, Hull, Render, VisDomGaussianRegularizer, VisibleDomain
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.geometry.cameras import look_at_camera, project, rays_of
+from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.cameras import project, rays_of
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hooks.regularizer import outside_loss

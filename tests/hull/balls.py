@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from visdom_plugin.geometry.cameras import Cameras, look_at_camera, rays_of
+from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.cameras import Cameras, rays_of
 
 
 def ring(count: int, distance: float = 4.0, *, size: int = 96, focal: float = 1.2, seed: int = 0) -> Cameras:

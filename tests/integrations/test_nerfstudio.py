@@ -374,7 +374,7 @@ def test_splats_pay_for_opacity_beside_the_hull(splat_model, train):
     assert {"main_loss", "mask_loss", "visdom_outside"} <= losses.keys()
     assert splat_model.info is left_behind and splat_model._get_downscale_factor() == 4
     view = splat_model.hook._draw(torch.Generator().manual_seed(splat_model.step))[0]
-    alpha = splat_model.render_opacity(view).alpha
+    alpha = splat_model.render_opacity(view)
     assert alpha.shape == (int(view.height), int(view.width))
     silhouette = depth_and_silhouette(splat_model.hook.hull, view)[1]
     expected = 0.5 * outside_loss(alpha, silhouette)

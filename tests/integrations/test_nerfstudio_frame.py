@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import visdom_plugin
-from visdom_plugin.geometry.cameras import Cameras, look_at_camera, look_at_point, rays_of
+from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.cameras import Cameras, look_at_point, rays_of
 from visdom_plugin.integrations.nerfstudio.frame import Similarity, frame_of
 
 

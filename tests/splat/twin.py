@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import torch
 
-from visdom_plugin.geometry.cameras import Cameras, look_at_camera
+from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.geometry.rotations import matrix_from_quaternion
 from visdom_plugin.splat.gaussians import Gaussians
 

@@ -15,7 +15,8 @@ from typing import Any
 import torch
 
 from visdom_plugin import registry
-from visdom_plugin.geometry.cameras import Cameras, look_at_camera, rays_of
+from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.cameras import Cameras, rays_of
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Scene, Views
 from visdom_plugin.seeding import generator

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.errors import SceneError
-from visdom_plugin.geometry.rotations import slerp
 
 
 class Rays(NamedTuple):
@@ -335,90 +334,3 @@ def look_at_point(cameras: Cameras) -> Tensor:
     pull = 1e-6 * len(cameras)
     matrix = across.sum(0) + pull * torch.eye(3).to(centres)
     return torch.linalg.solve(matrix, (across @ centres[:, :, None]).sum(0)[:, 0] + pull * prior)
-
-
-def interpolate(start: Cameras, end: Cameras, t: Tensor | float, look_at: Tensor) -> Cameras:
-    """Cameras on the way from one to another that keep a point where it is seen.
-
-    Rotations go along the shortest arc (slerp); the look-at point's camera coordinates go along a line. The
-    camera thus swings round that point instead of cutting through it, and is exactly `start` and `end` at 0
-    and 1.
-
-    Args:
-        start, end: (...) cameras. The result has the size of `start`, and intrinsics interpolated in units of
-            the image size.
-        t: (...) in [0, 1].
-        look_at: (3,) world frame.
-
-    Returns:
-        (...) cameras.
-    """
-    t = torch.as_tensor(t, dtype=start.intrinsics.dtype, device=start.intrinsics.device)
-    look_at = look_at.to(start.world_from_camera)
-    rotation = slerp(start.world_from_camera[..., :3, :3], end.world_from_camera[..., :3, :3], t)
-    seen_from = [
-        (c.camera_from_world @ torch.cat([look_at, look_at.new_ones(1)])[:, None])[..., :3, 0]
-        for c in (start, end)
-    ]
-    local = torch.lerp(*seen_from, t[..., None])
-    centre = look_at - (rotation @ local[..., None])[..., 0]
-    motion = torch.cat(
-        [torch.cat([rotation, centre[..., None]], -1), start.world_from_camera[..., 3:, :]], -2
-    )
-    other = end.resized(start.width, start.height)
-    intrinsics = torch.lerp(start.intrinsics, other.intrinsics, t[..., None, None])
-    return Cameras(intrinsics, motion, start.width, start.height)
-
-
-def look_at_camera(centre: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """world_from_camera of cameras at `centre` that look at `target`.
-
-    Args:
-        centre, target, up: (..., 3) world frame; `up` need not be perpendicular to the view.
-
-    Returns:
-        (..., 4, 4) motions, OpenCV axes.
-    """
-    z = torch.nn.functional.normalize(target - centre, dim=-1)
-    x = torch.linalg.cross(z, up.expand_as(z))
-    # Looking straight along `up`, any horizontal axis will do.
-    spare = torch.eye(3).to(z)[z.abs().argmin(-1)]
-    x = torch.where(x.norm(dim=-1, keepdim=True) < 1e-6, torch.linalg.cross(z, spare), x)
-    x = torch.nn.functional.normalize(x, dim=-1)
-    y = torch.linalg.cross(z, x)
-    top = torch.stack([x, y, z, centre.expand_as(z)], -1)
-    return torch.cat([top, top.new_tensor([0.0, 0, 0, 1]).expand(*top.shape[:-2], 1, 4)], -2)
-
-
-def orbit(cameras: Cameras, count: int, look_at: Tensor | None = None) -> Cameras:
-    """A full circle around the object at the capture's mean distance and height.
-
-    Args:
-        cameras: (N,) cameras of the capture; intrinsics and size are those of the first.
-        count: number of cameras on the circle.
-        look_at: (3,) centre of the circle; by default the capture's look-at point.
-
-    Returns:
-        (count,) cameras, starting at the first camera's azimuth.
-    """
-    target = look_at_point(cameras) if look_at is None else look_at.to(cameras.world_from_camera)
-    offsets = cameras.centres - target
-    distance = offsets.norm(dim=-1).mean()
-    # Turntables and rings share their mean up; a capture without one (views from above and below) gets z.
-    mean_up = -cameras.world_from_camera[:, :3, 1].mean(0)
-    up = mean_up if mean_up.norm() > 0.3 else mean_up.new_tensor([0.0, 0.0, 1.0])
-    up = up / up.norm()
-    sine = (torch.nn.functional.normalize(offsets, dim=-1) @ up).mean().clamp(-0.95, 0.95)
-    first = offsets[0] - (offsets[0] @ up) * up
-    if first.norm() < 1e-6 * distance:
-        first = torch.linalg.cross(up, torch.eye(3).to(up)[up.abs().argmin()])
-    east = torch.nn.functional.normalize(first, dim=-1)
-    north = torch.linalg.cross(up, east)
-    angle = torch.arange(count).to(up) * (2 * math.pi / count)
-    flat = torch.cos(angle)[:, None] * east + torch.sin(angle)[:, None] * north
-    centres = target + distance * ((1 - sine**2).sqrt() * flat + sine * up)
-    motion = look_at_camera(centres, target, up)
-    one = cameras[0]
-    return Cameras(
-        one.intrinsics.expand(count, 3, 3), motion, one.width.expand(count), one.height.expand(count)
-    )

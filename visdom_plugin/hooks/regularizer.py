@@ -6,20 +6,20 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.geometry.cameras import Cameras, interpolate, project, require_batch
+from visdom_plugin.geometry.camera_paths import interpolate
+from visdom_plugin.geometry.cameras import Cameras, project, require_batch
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.point_colours import check_images, colour_points
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.losses import below_one
-from visdom_plugin.render import Render
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +39,15 @@ def outside_loss(alpha: Tensor, hull_mask: Tensor) -> Tensor:
     if alpha.dtype in (torch.float16, torch.bfloat16):
         alpha = alpha.float()  # 1 - 1e-6 would round to 1
     return torch.where(hull_mask, 0.0, -torch.log1p(-below_one(alpha))).mean()
+
+
+class Opacity(Protocol):
+    """What the loss reads of a render."""
+
+    @property
+    def alpha(self) -> Tensor:
+        """Opacity (H, W), (H, W, 1) or (1, H, W, 1)."""
+        ...
 
 
 def _opacity(drawn: Any, shape: torch.Size) -> Tensor:
@@ -172,7 +181,7 @@ class VisDomGaussianRegularizer:
 
     def loss(
         self,
-        render: Callable[[Cameras], Render | Tensor],
+        render: Callable[[Cameras], Opacity | Tensor],
         step: int | None = None,
         generator: Generator | None = None,
     ) -> dict[str, Tensor]:

@@ -165,8 +165,9 @@ class _Means2d:
         """The rasteriser has seen to it."""
 
     @property
-    def grad(self) -> Tensor:
-        return self._means2d.grad[None]
+    def grad(self) -> Tensor | None:
+        grad = self._means2d.grad
+        return None if grad is None else grad[None]
 
 
 def _fade(opacities: Tensor, optimizer: torch.optim.Optimizer, gone: Tensor) -> None:

@@ -26,7 +26,8 @@ def ray_limits(
         rays_o, rays_d: (n_rays, 3) world frame; directions of unit length, as nerfacc wants them.
         near_plane, far_plane: as handed to nerfacc.
     """
-    near, far, _ = sampler.bound(rays_o, rays_d, near_plane, far_plane)
+    near, far = (rays_d.new_full(rays_d.shape[:-1], plane) for plane in (near_plane, far_plane))
+    near, far, _ = sampler.bound(rays_o, rays_d, near, far)
     return {"t_min": near, "t_max": far}
 
 
@@ -37,8 +38,8 @@ def ray_planes(
 
     Its arithmetic takes a plane per ray as well as one for all. Arguments as in `ray_limits`.
     """
-    near, far, _ = sampler.bound(rays_o, rays_d, near_plane, far_plane)
-    return {"near_plane": near[:, None], "far_plane": far[:, None]}
+    limits = ray_limits(sampler, rays_o, rays_d, near_plane, far_plane)
+    return {"near_plane": limits["t_min"][:, None], "far_plane": limits["t_max"][:, None]}
 
 
 @torch.no_grad()

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from tests.hull.balls import ball_masks, box_masks, random_cameras, random_masks, ring
-from visdom_plugin.geometry.cameras import Cameras, look_at_camera
+from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving import culling
 from visdom_plugin.hull.carving.octree import sum_areas
 from visdom_plugin.hull.carving.votes import Grid, gather_silhouettes

@@ -2,7 +2,8 @@ import numpy as np
 import torch
 
 from tests.hull.balls import ring
-from visdom_plugin.geometry.cameras import Cameras, look_at_camera
+from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.point_colours import colour_points
 

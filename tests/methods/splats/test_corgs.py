@@ -12,7 +12,8 @@ from datamodules.synthetic.scene import SyntheticConfig, make_scene
 from method_configs.corgs_lite import PRESETS, QUICK
 from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.errors import SceneError
-from visdom_plugin.geometry.cameras import Cameras, look_at_camera, look_at_point, project
+from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.cameras import Cameras, look_at_point, project
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.splats.corgs_lite import CorgsLite, co_regularisation, unmatched

@@ -124,7 +124,8 @@ def choose_cameras(path: str, frames: int, scene, hull):
     """
     import torch
 
-    from visdom_plugin.geometry.cameras import Cameras, interpolate, look_at_point, orbit
+    from visdom_plugin.geometry.camera_paths import interpolate, orbit
+    from visdom_plugin.geometry.cameras import Cameras, look_at_point
 
     if path in ("train", "test"):
         if not len(getattr(scene, path)):

@@ -20,7 +20,7 @@ def choose_cameras(which: str, scene, hull, frames: int) -> tuple[Cameras, list[
     import torch
 
     from visdom_plugin.figures.contact_sheet import picture_names
-    from visdom_plugin.geometry.cameras import orbit
+    from visdom_plugin.geometry.camera_paths import orbit
 
     if which == "orbit":
         centre = torch.as_tensor(hull.centre)

@@ -13,6 +13,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider, SceneCollider
+from nerfstudio.models.base_model import Model
 from nerfstudio.models.instant_ngp import InstantNGPModelConfig, NGPModel
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from torch import Tensor
@@ -103,8 +104,11 @@ def silhouette_loss(accumulation: Tensor, image: Tensor) -> Tensor:
         return mask_loss(accumulation[..., 0].float(), image[..., 3].to(accumulation.device).float())
 
 
-class _HullField:
+class _HullField(Model):
     """What both methods get; stands before the model's own class."""
+
+    method: str
+    collider: SceneCollider | None
 
     def populate_modules(self) -> None:
         super().populate_modules()

@@ -26,9 +26,9 @@ from visdom_plugin.integrations.nerfstudio.fields import InstantNgpVdConfig, Ner
 from visdom_plugin.integrations.nerfstudio.splats import SplatfactoVdConfig
 
 # Since 2.6 torch loads tensors and plain data only, and nerfstudio's own checkpoints hold their learning rates as
-# numpy numbers. Allowing these is what ns-eval, ns-viewer and --load-dir need, for every method.
+# numpy numbers. Allowing these is what ns-eval, ns-viewer and --load-dir need, for every method. Numpy is below 2.
 torch.serialization.add_safe_globals(
-    [np.core.multiarray.scalar, np.dtype, type(np.dtype(np.float64)), _codecs.encode]
+    [np.core.multiarray.scalar, np.dtype, type(np.dtype(np.float64)), _codecs.encode]  # type: ignore[attr-defined]
 )
 
 

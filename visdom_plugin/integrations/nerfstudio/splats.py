@@ -9,7 +9,6 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import torch
 from gsplat.strategy.ops import remove
@@ -24,13 +23,6 @@ from visdom_plugin.integrations.nerfstudio.dataparser import host_cameras, told
 from visdom_plugin.integrations.nerfstudio.fields import known_views, silhouette_loss
 
 REGULARIZER = RegularizerConfig(enabled=True)
-
-
-class Opacity(NamedTuple):
-    """What L_i reads of a render."""
-
-    alpha: Tensor
-    """(H, W)."""
 
 
 @dataclass
@@ -83,11 +75,11 @@ class SplatfactoVd(SplatfactoModel):
             losses |= self.hook.loss(self.render_opacity, self.step, torch.Generator().manual_seed(self.step))
         return losses
 
-    def render_opacity(self, camera: Cameras) -> Opacity:
-        """What one of our cameras sees, at its full size, with gradients and without traces in the model."""
+    def render_opacity(self, camera: Cameras) -> Tensor:
+        """Opacity (H, W) in one of our cameras, at its full size, with gradients, without traces in the model."""
         with self._aside():
             outputs = self.get_outputs(host_cameras(camera_batch(camera), self.frame).to(self.device))
-        return Opacity(outputs["accumulation"][..., 0])
+        return outputs["accumulation"][..., 0]
 
     @contextlib.contextmanager
     def _aside(self) -> Iterator[None]:
@@ -111,7 +103,7 @@ class SplatfactoVd(SplatfactoModel):
     def prune_outside(self, step: int) -> None:
         """Removes Gaussians outside the hull, with their part of the optimisers and of the strategy's state."""
         world = SimpleNamespace(means=self.frame.points_to_world(self.means.detach()))
-        outside = self.hook.after_step(world, step)
+        outside = None if self.hook is None else self.hook.after_step(world, step)
         if outside is None or not bool(outside.any()) or bool(outside.all()):
             return
         remove(self.gauss_params, self.optimizers, self.strategy_state, outside)

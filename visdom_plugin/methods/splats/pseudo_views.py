@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.geometry.cameras import Cameras, interpolate, look_at_camera, look_at_point
+from visdom_plugin.geometry.camera_paths import interpolate, look_at_camera
+from visdom_plugin.geometry.cameras import Cameras, look_at_point
 
 HEIGHT_VARIATION = 0.1
 """Share of the cameras' own spread in height that the ellipse keeps (CoR-GS, after mip-NeRF 360's test paths)."""
