@@ -54,8 +54,9 @@ def main() -> None:
         method.setup(scene.train, hooks, hull=hull, device=cpu, seed=0)
         data = DataManager(scene.train, 0)
         for step in range(given.steps):
-            sum(method.train_step(data.view_batch(step), step).values()).backward()
-            method.optimise(step)
+            output = method.train_step(data.view_batch(step), step)
+            output.total.backward()
+            method.optimise(step, output)
         found = evaluate(method, whole.test, reference_hull=None, device=cpu)["test"]
         shown = ", ".join(
             f"{key} {found[key]:.4g}" for key in ("psnr", "psnr_foreground", "ssim", "silhouette_iou")

@@ -44,8 +44,9 @@ def main() -> None:
                 batch = data.pixel_batch(step, args.rays)
                 for one, spent in zip(pair, times, strict=True):
                     began = time.perf_counter()
-                    sum(one.train_step(batch, step).values()).backward()
-                    one.optimise(step)
+                    output = one.train_step(batch, step)
+                    output.total.backward()
+                    one.optimise(step, output)
                     spent.append(time.perf_counter() - began)
             last = [1000 * statistics.median(spent[3 * args.steps // 4 :]) for spent in times]
             views = [view_seconds(one, scene) for one in pair]

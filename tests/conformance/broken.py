@@ -62,6 +62,11 @@ class Field(WholeField):
         return [folder / "grid.npy"]
 
 
+def changed(output, **losses):
+    """A step's output with some losses replaced."""
+    return replace(output, losses={**output.losses, **losses})
+
+
 @breaks("test_the_schedule_has_a_length")
 class FractionalLength(Field):
     def __init__(self, config):
@@ -72,7 +77,7 @@ class FractionalLength(Field):
 @breaks("test_losses_are_named_finite_scalars")
 class NotANumber(Field):
     def train_step(self, batch, step):
-        return super().train_step(batch, step) | {"depth": torch.tensor(float("nan"))}
+        return changed(super().train_step(batch, step), depth=torch.tensor(float("nan")))
 
 
 @breaks("test_batches_are_left_as_they_were")
@@ -119,8 +124,8 @@ class DoubleOnly(Field):
 @breaks("test_randomness_comes_from_seed_and_step_alone")
 class Gambler(Field):
     def train_step(self, batch, step):
-        losses = super().train_step(batch, step)
-        return losses | {"colour": losses["colour"] * (1 + torch.rand(()))}
+        output = super().train_step(batch, step)
+        return changed(output, colour=output.losses["colour"] * (1 + torch.rand(())))
 
 
 @breaks("test_a_resumed_run_equals_the_uninterrupted_one")
@@ -140,8 +145,8 @@ class HullLover(Field):
 @breaks("test_the_hook_enabled_but_not_there_is_the_hook_switched_off")
 class ConfigReader(Field):
     def train_step(self, batch, step):
-        losses = super().train_step(batch, step)
-        return losses | {"colour": (2 if self.config.vd.enabled else 1) * losses["colour"]}
+        output = super().train_step(batch, step)
+        return changed(output, colour=(2 if self.config.vd.enabled else 1) * output.losses["colour"])
 
 
 @breaks("test_rays_are_sampled_within_their_bounds_only")

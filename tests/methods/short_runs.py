@@ -20,11 +20,10 @@ def advance(method, scene, steps):
     """Trains the given steps; returns the loss of each."""
     batches, history = choose_batches(method, DataManager(scene.train, seed=0)), []
     for step in steps:
-        losses = method.train_step(batches(step), step)
-        total = sum(losses.values())
-        total.backward()
-        method.optimise(step)
-        history.append(float(total.detach()))
+        output = method.train_step(batches(step), step)
+        output.total.backward()
+        method.optimise(step, output)
+        history.append(float(output.total.detach()))
     return history
 
 

@@ -20,6 +20,7 @@ from visdom_plugin.geometry.cameras import Cameras, rays_of
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Scene, Views
 from visdom_plugin.seeding import generator
+from visdom_plugin.training.protocols import StepOutput
 
 NAME = "fake"
 
@@ -66,9 +67,9 @@ class FakeMethod:
         noise = torch.rand(3, generator=generator(self.seed, "noise", step))
         target = (image * mask).sum((0, 1)) / mask.sum() + self.config.inner.weight * 0.1 * noise
         loss = (self.colours[batch.index] - target).square().mean()
-        return {"colour": loss * (float("nan") if step == self.config.nan_at else 1)}
+        return StepOutput({"colour": loss * (float("nan") if step == self.config.nan_at else 1)})
 
-    def optimise(self, step):
+    def optimise(self, step, output):
         self.adam.step()
         self.adam.zero_grad()
 

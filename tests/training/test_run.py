@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from tests.training.fake import FakeConfig, FakeInner, FakeManager, FakeMethod, tiny_views
-from visdom_plugin.errors import CheckpointError, EmptyHullError
+from visdom_plugin.errors import CheckpointError, EmptyHullError, PluginError
 from visdom_plugin.scene import Scene, Views
 from visdom_plugin.training import metrics
 from visdom_plugin.training.run import Interrupted
@@ -290,8 +290,12 @@ def test_a_damaged_last_checkpoint_costs_steps_but_not_the_result(train, tmp_pat
     train(run_dir=tmp_path / "whole")
     run = tmp_path / "run"
     step_of = FakeMethod.optimise
+
+    def failing_step(self, step, output):
+        return 1 / 0 if step == 20 else step_of(self, step, output)
+
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
-        patch.setattr(FakeMethod, "optimise", lambda self, step: 1 / 0 if step == 20 else step_of(self, step))
+        patch.setattr(FakeMethod, "optimise", failing_step)
         train(checkpoint_seconds=0)
     assert json.loads((run / "run.json").read_text())["status"] == "failed"
     newest = run / "checkpoints" / "step-00000020.safetensors"
@@ -379,9 +383,22 @@ def test_progress_says_how_far_and_how_good_unless_quiet(train, tmp_path, capsys
 
 
 def test_a_method_may_bring_its_own_training_psnr(train, tmp_path, monkeypatch):
-    monkeypatch.setattr(FakeMethod, "metrics", {"psnr": torch.tensor(12.5)}, raising=False)
+    step_of = FakeMethod.train_step
+
+    def measured_step(self, batch, step):
+        return replace(step_of(self, batch, step), metrics={"psnr": torch.tensor(12.5)})
+
+    monkeypatch.setattr(FakeMethod, "train_step", measured_step)
     train()
     assert {row["psnr"] for row in _log(tmp_path / "run")} == {12.5}
+
+
+def test_a_method_that_returns_bare_losses_is_told_what_to_return(train, monkeypatch):
+    step_of = FakeMethod.train_step
+    monkeypatch.setattr(FakeMethod, "train_step", lambda *given: dict(step_of(*given).losses))
+    with pytest.raises(PluginError, match="returned a dict, not a StepOutput") as refused:
+        train()
+    assert "FakeMethod" in str(refused.value.where)
 
 
 def test_scenes_without_test_views_still_train(train, scene):

@@ -84,7 +84,7 @@ class GaussianProbe:
 
 def gradient(method: Any, batch: Any, step: int) -> dict[int, Tensor]:
     """What `train_step` says of the parameters, by their identity: leaves of the losses' graph, no step taken."""
-    total = sum(method.train_step(batch, step).values())
+    total = method.train_step(batch, step).total
     leaves, seen = {}, set()
     stack = [total.grad_fn] if total.requires_grad else []
     while stack:

@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from visdom_plugin.conformance.report import require
 from visdom_plugin.registry import Preset, Registry
 from visdom_plugin.scene import Scene
 from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.evaluate import hull_silhouette, render_on_white
 from visdom_plugin.training.metrics import outside_hull_mass
+from visdom_plugin.training.protocols import Method, StepOutput
 from visdom_plugin.training.run import choose_batches, make_hooks
 
 CPU = torch.device("cpu")
@@ -100,10 +102,16 @@ class Subject:
         states, losses = {}, []
         for step in range(first, last):
             seed_all(1000 * luck + step)
-            found = method.train_step(batches(step), step)
-            losses.append({k: v.detach().clone() for k, v in found.items()})
-            sum(found.values()).backward()
-            method.optimise(step)
+            output = method.train_step(batches(step), step)
+            require(
+                isinstance(output, StepOutput),
+                f"train_step({step}) returned a {type(output).__name__}",
+                Method.train_step,
+                "return StepOutput({'colour': error.mean()})",
+            )
+            losses.append({k: v.detach().clone() for k, v in output.losses.items()})
+            output.total.backward()
+            method.optimise(step, output)
             if step + 1 in keep or step + 1 == last:
                 states[step + 1] = copy_state(method)
         return Run(method, states, losses)

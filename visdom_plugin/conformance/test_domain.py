@@ -209,7 +209,7 @@ def pull_of(method: Any, step: int) -> Callable[[], float]:
     """How much pixels that show no object pull at the field, whenever it is asked: always the same pixels."""
     batch_of = choose_batches(method, DataManager(scene().train, 0))
     # Two batches: what both have in common, such as the decay of parameters, does not come from the rays.
-    batches = [batch_of(i)._replace(mask=torch.zeros_like(batch_of(i).mask)) for i in (step, step + 1)]
+    batches = [replace(batch, mask=torch.zeros_like(batch.mask)) for batch in map(batch_of, (step, step + 1))]
 
     def pull() -> float:
         one, other = (gradient(method, batch, step) for batch in batches)

@@ -13,7 +13,7 @@ from visdom_plugin.conformance.report import require
 from visdom_plugin.conformance.subject import CPU, copy_state, difference, scene
 from visdom_plugin.render import Render
 from visdom_plugin.training.batches import DataManager
-from visdom_plugin.training.protocols import Method
+from visdom_plugin.training.protocols import Method, StepOutput
 from visdom_plugin.training.run import choose_batches
 
 DEVICES = [
@@ -38,13 +38,13 @@ def test_losses_are_named_finite_scalars(subject):
             require(
                 isinstance(name, str) and value.shape == () and value.is_floating_point(),
                 f"train_step({step}) returned {name!r} of shape {tuple(value.shape)} and {value.dtype}",
-                Method.train_step,
-                "return a dict from names to scalar tensors, such as {'colour': error.mean()}",
+                StepOutput,
+                "name scalar tensors, as in StepOutput({'colour': error.mean()})",
             )
             require(
                 bool(value.isfinite()),
                 f"train_step({step}) returned {name!r} = {float(value)}",
-                Method.train_step,
+                StepOutput,
                 "keep logarithms and divisions away from 0; leave a loss that does not apply out of the dict",
             )
 
@@ -56,8 +56,8 @@ def test_batches_are_left_as_they_were(subject):
     method.train_step(batch, 0)
     changed = [
         name
-        for name, one, other in zip(batch._fields, batch, before, strict=True)
-        if isinstance(one, torch.Tensor) and not torch.equal(one, other)
+        for name, value in vars(before).items()
+        if isinstance(value, torch.Tensor) and not torch.equal(value, getattr(batch, name))
     ]
     require(
         not changed,
@@ -181,15 +181,15 @@ def test_devices_and_dtypes_are_respected(subject, device):
     method = subject.trained.method if target == CPU else subject.start(device=target)
     data = DataManager(scene().train, 0, device=target)
     if target != CPU:
-        losses = method.train_step(choose_batches(method, data)(0), 0)
+        output = method.train_step(choose_batches(method, data)(0), 0)
         require(
-            all(v.device.type == device for v in losses.values()),
-            f"losses are on {[str(v.device) for v in losses.values()]}, the method on {device}",
+            all(v.device.type == device for v in output.losses.values()),
+            f"losses are on {[str(v.device) for v in output.losses.values()]}, the method on {device}",
             Method.train_step,
             "make tensors on the device that setup() was given",
         )
-        sum(losses.values()).backward()
-        method.optimise(0)
+        output.total.backward()
+        method.optimise(0, output)
     shown = {}
     for dtype in (torch.float64, torch.float32):
         camera = scene().test.cameras[0].to(target, dtype)

@@ -5,22 +5,15 @@ The schedule is the method's: when to densify, prune or reset is said by whoever
 
 from __future__ import annotations
 
-import logging
-
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.losses import composite, mask_loss, photometric_loss
 from visdom_plugin.render import Render
-from visdom_plugin.splat.cpu.backend import warm_up
 from visdom_plugin.splat.densify import initial_log_scales, split_children
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.optimiser import GaussianOptimiser
 from visdom_plugin.splat.set_config import GaussianSetConfig
 from visdom_plugin.splat.spherical_harmonics import sh_from_rgb
-
-log = logging.getLogger(__name__)
 
 INITIAL_OPACITY = 0.1  # 3DGS
 RESET_OPACITY = 0.01  # 3DGS
@@ -161,40 +154,3 @@ class GaussianSet:
         self._count = self._count + visible
         radii = info["radii"] if info["radii"].ndim == 1 else info["radii"].amax(-1)
         self._radius_px = torch.maximum(self._radius_px, torch.where(visible, radii, 0).float())
-
-
-def fit_view(
-    render: Render, batch, background: Tensor, config: GaussianSetConfig
-) -> tuple[dict[str, Tensor], float]:
-    """How far the render of a training view is from its photograph on the same background.
-
-    Returns:
-        Weighted losses by name, and the PSNR in dB.
-    """
-    weight = batch.weight
-    target = composite(batch.image, batch.mask, background, alpha=render.alpha, mask_known=batch.mask_known)
-    errors = (render.rgb.detach() - target).square()
-    mse = errors.mean() if weight is None else (errors.mean(-1) * weight).sum() / weight.sum().clamp_min(1)
-    losses = {"photometric": photometric_loss(render.rgb, target, config.ssim_weight, weight)}
-    if config.mask_weight and batch.mask_known:
-        losses["mask"] = config.mask_weight * mask_loss(render.alpha, batch.mask, weight)
-    return losses, float(-10 * mse.clamp_min(1e-10).log10())
-
-
-def draw_background(config: GaussianSetConfig, draw: Generator, device: torch.device) -> Tensor:
-    """(3,) the training background of a step."""
-    background = torch.rand(3, generator=draw) if config.background == "random" else torch.ones(3)
-    return background.to(device)
-
-
-def load_kernels(device: torch.device) -> None:
-    """Compiles the CPU rasteriser ahead of the first step, and says so."""
-    if device.type == "cpu":
-        log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
-        warm_up()
-
-
-def scene_extent(cameras: Cameras) -> float:
-    """1.1 x the farthest camera from the cameras' mean, in scene units (3DGS). Training cameras only."""
-    centres = cameras.centres
-    return float(1.1 * (centres - centres.mean(0)).norm(dim=-1).max())

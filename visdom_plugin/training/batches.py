@@ -2,50 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from visdom_plugin.errors import SceneError
-from visdom_plugin.geometry.cameras import Cameras, pixel_radius, rays_of
+from visdom_plugin.geometry.cameras import pixel_radius, rays_of
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
-
-
-class ViewBatch(NamedTuple):
-    """One whole training view."""
-
-    index: int
-    camera: Cameras
-    """One camera, shape ()."""
-    image: Tensor
-    """(H, W, 3) float32 in [0, 1], background as photographed."""
-    mask: Tensor
-    """(H, W) float32, 1 on the object."""
-    mono_depth: Tensor | None
-    """(H, W) float32 in its own unit."""
-    weight: Tensor | None = None
-    """(H, W) float32, 0 at pixels that take part in no loss, else 1; None when all of them do."""
-    mask_known: bool = True
-    """False for a view that is good for colour only: its mask says nothing."""
-
-
-class PixelBatch(NamedTuple):
-    """Pixels drawn evenly over all training views, ignored ones left out."""
-
-    origins: Tensor
-    """(n, 3) float32 world frame."""
-    directions: Tensor
-    """(n, 3) float32 unit, through the pixels' centres."""
-    rgb: Tensor
-    """(n, 3) float32 in [0, 1]."""
-    mask: Tensor
-    """(n,) float32, 1 on the object."""
-    radii: Tensor
-    """(n,) float32 radius of each pixel's cone at distance 1."""
-    mask_known: Tensor | None = None
-    """(n,) bool, False at pixels of views that are good for colour only; None when all masks are known."""
+from visdom_plugin.training.protocols import PixelBatch, ViewBatch
 
 
 class DataManager:

@@ -1,8 +1,10 @@
-"""What a trainer asks of a method."""
+"""The calls a trainer makes of a method, and the values that pass between them: batches and a step's output."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import reduce
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -10,8 +12,65 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
+
+
+@dataclass(frozen=True)
+class ViewBatch:
+    """One whole training view."""
+
+    index: int
+    camera: Cameras
+    """One camera, shape ()."""
+    image: Tensor
+    """(H, W, 3) float32 in [0, 1], background as photographed."""
+    mask: Tensor
+    """(H, W) float32, 1 on the object."""
+    mono_depth: Tensor | None
+    """(H, W) float32 in its own unit."""
+    weight: Tensor | None = None
+    """(H, W) float32, 0 at pixels that take part in no loss, else 1; None when all of them do."""
+    mask_known: bool = True
+    """False for a view that is good for colour only: its mask says nothing."""
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """Pixels drawn evenly over all training views, ignored ones left out."""
+
+    origins: Tensor
+    """(n, 3) float32 world frame."""
+    directions: Tensor
+    """(n, 3) float32 unit, through the pixels' centres."""
+    rgb: Tensor
+    """(n, 3) float32 in [0, 1]."""
+    mask: Tensor
+    """(n,) float32, 1 on the object."""
+    radii: Tensor
+    """(n,) float32 radius of each pixel's cone at distance 1."""
+    mask_known: Tensor | None = None
+    """(n,) bool, False at pixels of views that are good for colour only; None when all masks are known."""
+
+
+@dataclass(frozen=True)
+class StepOutput:
+    """The forward pass of one training step."""
+
+    losses: Mapping[str, Tensor]
+    """Named, weighted, finite scalars; the trainer differentiates their sum."""
+    metrics: Mapping[str, Tensor] = field(default_factory=dict)
+    """Named scalars without gradient, on the method's device: the trainer reads them when it writes a line of the
+    log, so that no step waits for the device. "psnr", in dB, is shown while training goes on."""
+    renders: Sequence[Render] = ()
+    """The training view as drawn, for methods whose `optimise` measures it after the backward pass, as
+    densification does; the trainer only hands them on."""
+
+    @property
+    def total(self) -> Tensor:
+        """The sum of the losses, a scalar."""
+        return reduce(torch.add, self.losses.values())
 
 
 class Method(Protocol):
@@ -21,8 +80,8 @@ class Method(Protocol):
     draws the same numbers. `visdom_plugin.seeding.generator(seed, "what for", step)` makes such numbers.
 
     A method with a `pixels_per_step(step) -> int` is handed that many pixels of all views per step
-    (`visdom_plugin.training.batches.PixelBatch`), any other one a whole view (`ViewBatch`). The number may depend
-    on the method's state, which then is part of `state_dict`.
+    (`PixelBatch`), any other one a whole view (`ViewBatch`). The number may depend on the method's state, which
+    then is part of `state_dict`.
 
     Fields of the config that have a meaning here: `mask_weight`, the weight of the silhouette loss; `hull`, what
     to carve; `vd`, the hook's settings. `visdom_plugin.specs.MethodSpec` adds them where a config lacks them.
@@ -36,7 +95,7 @@ class Method(Protocol):
     """Length of the schedule, 1 or more; the trainer calls steps 0 .. total_steps - 1."""
 
     def setup(
-        self, views: Views, hooks: Sequence[Any], *, hull: Any, device: torch.device, seed: int
+        self, views: Views, hooks: Sequence[Any], *, hull: Hull | None, device: torch.device, seed: int
     ) -> None:
         """Builds parameters and optimisers on `device` from the training views.
 
@@ -45,15 +104,19 @@ class Method(Protocol):
         """
         ...
 
-    def train_step(self, batch: Any, step: int) -> dict[str, Tensor]:
-        """Forward pass: named, weighted, finite scalar losses whose sum the trainer differentiates.
+    def train_step(self, batch: Any, step: int) -> StepOutput:
+        """The forward pass.
 
-        The batch belongs to the trainer and stays as it is.
+        The batch, a `ViewBatch` or `PixelBatch`, belongs to the trainer and stays as it is.
         """
         ...
 
-    def optimise(self, step: int) -> None:
-        """After the backward pass: optimiser steps, schedules, densification, hooks' `after_step`."""
+    def optimise(self, step: int, output: StepOutput) -> None:
+        """After the backward pass: optimiser steps, schedules, densification, hooks' `after_step`.
+
+        `output` is what `train_step` returned for this step, its losses differentiated. Nothing else that the
+        forward pass leaves behind may be needed here.
+        """
         ...
 
     def render(self, camera: Cameras, background: Tensor) -> Render:

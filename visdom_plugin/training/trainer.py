@@ -11,11 +11,11 @@ from typing import Any
 
 import torch
 
-from visdom_plugin.errors import VisDomError
+from visdom_plugin.errors import PluginError, VisDomError
 from visdom_plugin.render import quantise
 from visdom_plugin.training import metrics
 from visdom_plugin.training.progress import Progress
-from visdom_plugin.training.protocols import Method
+from visdom_plugin.training.protocols import Method, StepOutput
 from visdom_plugin.training.runs import checkpoints
 from visdom_plugin.training.runs.run_directory import RunDir
 
@@ -53,7 +53,7 @@ class Trainer:
             run: opened run directory.
             checkpoint_seconds: time between two checkpoints; one is always taken at the end.
             train_psnr: PSNR of a training view for the progress line, a function of the step; used where the
-                method has no `metrics` dict with a "psnr" of its own.
+                method's steps give no metric "psnr" of their own.
         """
         self.method, self.batch_of, self.run_dir = method, batch_of, run
         self.device, self.quiet, self.checkpoint_seconds = device, quiet, checkpoint_seconds
@@ -81,22 +81,22 @@ class Trainer:
         ):
             while self.step < total and not self.stopped:
                 began = time.monotonic()
-                losses = self.method.train_step(self.batch_of(self.step), self.step)
-                whole = sum(losses.values())
+                output = self.method.train_step(self.batch_of(self.step), self.step)
+                total_loss = _check_output(output, self.method).total
                 due = (self.step + 1) % log_every == 0 or self.step + 1 == total
                 save = began - saved >= self.checkpoint_seconds or self.step + 1 == total or self.stopped
                 if due or save or (self.step + 1) % check_every == 0:
-                    loss = float(whole.detach())
+                    loss = float(total_loss.detach())
                     if not abs(loss) < float("inf"):
-                        self._fail(losses)
-                whole.backward()
-                self.method.optimise(self.step)
+                        self._fail(output)
+                total_loss.backward()
+                self.method.optimise(self.step, output)
                 self.step += 1
                 self.train_s += time.monotonic() - began
                 if due:
-                    psnr = self._measure_psnr(log_every)
+                    psnr = self._measure_psnr(output, log_every)
                     row = {"step": self.step, "loss": loss}
-                    row |= {f"loss_{k}": float(v.detach()) for k, v in losses.items()}
+                    row |= {f"loss_{k}": float(v.detach()) for k, v in output.losses.items()}
                     self.run_dir.log(row | {"psnr": psnr, "train_s": round(self.train_s, 3)})
                 if save:
                     self._save()
@@ -123,8 +123,8 @@ class Trainer:
             notes = {"train_s": self.train_s, "total_steps": self.method.total_steps}
             checkpoints.save(self.folder, self.step, self.method.state_dict(), notes)
 
-    def _measure_psnr(self, log_every: int) -> float | None:
-        own = getattr(self.method, "metrics", {}).get("psnr")
+    def _measure_psnr(self, output: StepOutput, log_every: int) -> float | None:
+        own = output.metrics.get("psnr")
         if own is not None:
             return float(own)
         # A whole render costs several steps of some methods: every fifth line has one.
@@ -133,8 +133,8 @@ class Trainer:
         value = self.train_psnr(self.step)
         return value if value == value and value != float("inf") else None
 
-    def _fail(self, losses: dict[str, Any]) -> None:
-        parts = ", ".join(f"{name} {float(value.detach()):.4g}" for name, value in losses.items())
+    def _fail(self, output: StepOutput) -> None:
+        parts = ", ".join(f"{k} {float(v.detach()):.4g}" for k, v in output.losses.items())
         raise TrainingError(
             f"the loss is no longer a finite number at step {self.step} ({parts})",
             where=self.run_dir.path,
@@ -146,6 +146,17 @@ class Trainer:
         self.stopped = True
 
 
+def _check_output(output: Any, method: Method) -> StepOutput:
+    if isinstance(output, StepOutput):
+        return output
+    raise PluginError(
+        f"train_step returned a {type(output).__name__}, not a StepOutput",
+        where=f"{type(method).__module__}.{type(method).__qualname__}",
+        cause="a method written for visdom-plugin 0.1.0, whose train_step returned the losses alone",
+        todo="return visdom_plugin.training.protocols.StepOutput(losses), and take it in optimise(step, output)",
+    )
+
+
 @contextmanager
 def _signals(stop: Callable[[], None]) -> Iterator[None]:
     """Ctrl-C and SIGTERM call `stop` once; a second Ctrl-C interrupts at once."""
@@ -153,7 +164,7 @@ def _signals(stop: Callable[[], None]) -> Iterator[None]:
         yield
         return
 
-    def handle(number, frame) -> None:
+    def handle(number: int, frame: Any) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         stop()
 

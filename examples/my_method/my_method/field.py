@@ -1,10 +1,10 @@
 import torch
-from torch.nn.functional import grid_sample
 
 from visdom_plugin.methods.fields import common
 from visdom_plugin.nerf.frame import frame_of
 from visdom_plugin.nerf.optimiser import FieldOptimiser
 from visdom_plugin.nerf.rendering.volume import composite, weights_from_density
+from visdom_plugin.training.protocols import StepOutput
 
 
 class Field:
@@ -21,8 +21,8 @@ class Field:
 
     def look(self, points):
         at = (points.to(self.device) / self.radius).flip(-1).reshape(1, -1, 1, 1, 3)
-        values = grid_sample(self.grid, at, padding_mode="border", align_corners=True)[0, :, :, 0, 0]
-        return torch.exp(20 * values[0] - 1), (10 * values[1:]).T.sigmoid()
+        values = torch.nn.functional.grid_sample(self.grid, at, padding_mode="border", align_corners=True)
+        return torch.exp(20 * values[0, 0, :, 0, 0] - 1), (10 * values[0, 1:, :, 0, 0]).T.sigmoid()
 
     def trace(self, origins, directions, background, hooks, training=False):
         nearest = -(self.frame.to_local(origins) * directions).sum(-1).float()
@@ -36,10 +36,10 @@ class Field:
     def train_step(self, batch, step):
         white = torch.ones(3, device=self.device)
         rgb, alpha, _ = self.trace(batch.origins, batch.directions, white, self.hooks, training=True)
-        colour = (rgb - common.photograph_on(white, batch, alpha)).square().mean()
-        return {"colour": colour, "mask": self.config.mask_weight * common.silhouette_loss(alpha, batch)}
+        losses = {"colour": (rgb - common.photograph_on(white, batch, alpha)).square().mean()}
+        return StepOutput(losses | {"mask": self.config.mask_weight * common.silhouette_loss(alpha, batch)})
 
-    def optimise(self, step):
+    def optimise(self, step, output):
         self.optimiser.step(learning_rate=0.02)
 
     def render(self, camera, background):

@@ -58,9 +58,9 @@ def test_the_field_outside_the_hull_has_no_part_in_training(scene, shards, monke
     config = replace(CONFIG, vd=replace(CONFIG.vd, drop_outside=drop))
     method = start(Ingp, scene, shards, config)
     batch = DataManager(scene.train, seed=0).pixel_batch(1, 400)
-    clean = method.train_step(batch, 1)["colour"]
+    clean = method.train_step(batch, 1).losses["colour"]
     _poison(method, shards, monkeypatch)
-    poisoned = method.train_step(batch, 1)["colour"]
+    poisoned = method.train_step(batch, 1).losses["colour"]
     # Bounds without a band are not enough: they let rays sample the gaps between the shards.
     assert bool(poisoned.isfinite()) is drop
     assert torch.equal(clean, poisoned) is drop
@@ -95,7 +95,7 @@ def test_a_batch_beside_the_hull_teaches_nothing_and_breaks_nothing(scene, shard
     fields = {f: getattr(batch, f) for f in ("origins", "directions", "rgb", "mask", "mask_known", "radii")}
     beside = type("Batch", (), {f: None if v is None else v[~hit] for f, v in fields.items()})
     assert int((~hit).sum()) > 20
-    method.train_step(beside, 1)["colour"].backward()
+    method.train_step(beside, 1).losses["colour"].backward()
     assert not method.table.grad.any()
 
 

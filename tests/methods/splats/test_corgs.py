@@ -179,7 +179,7 @@ def test_in_training_no_gradient_crosses_from_one_set_to_the_other(scene, hull):
     method = start(scene, hull, config)
     advance(method, scene, range(20))  # until they differ
     batch = DataManager(scene.train, seed=0).view_batch(20)
-    losses = method.train_step(batch, 20)
+    losses = method.train_step(batch, 20).losses
     assert {"co_0", "co_1", "visdom_outside_0", "visdom_outside_1"} <= losses.keys()
     for name, value in losses.items():
         own = int(name[-1])
@@ -194,10 +194,10 @@ def test_pseudo_views_end_when_they_should(scene, hull):
     method = start(scene, hull, config)
     data, found = DataManager(scene.train, seed=0), []
     for step in range(14):
-        losses = method.train_step(data.view_batch(step), step)
-        sum(losses.values()).backward()
-        method.optimise(step)
-        if "co_0" in losses:
+        output = method.train_step(data.view_batch(step), step)
+        output.total.backward()
+        method.optimise(step, output)
+        if "co_0" in output.losses:
             found.append(step + 1)
     assert found == [3, 6, 9]
 

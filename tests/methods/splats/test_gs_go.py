@@ -10,9 +10,9 @@ from method_configs.gs_go import PRESETS, QUICK
 from tests.methods.short_runs import advance, set_up
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.methods.splats.common import scene_extent
 from visdom_plugin.methods.splats.gs_go import GsGo
 from visdom_plugin.methods.splats.initial_points import mean_masked_colour
-from visdom_plugin.splat.model import scene_extent
 
 SMALL = replace(
     QUICK,

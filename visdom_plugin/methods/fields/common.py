@@ -6,8 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -17,7 +16,9 @@ from visdom_plugin.geometry.cameras import Cameras, pixel_radius, rays_of
 from visdom_plugin.hooks.protocols import SamplerHook
 from visdom_plugin.losses import composite, mask_loss
 from visdom_plugin.nerf.frame import Frame
+from visdom_plugin.nerf.optimiser import FieldOptimiser
 from visdom_plugin.render import Render
+from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
 log = logging.getLogger(__name__)
 
@@ -71,29 +72,39 @@ def spread_rays(camera: Cameras, most: int = 256) -> tuple[Tensor, Tensor]:
     return rays_of(camera.to(dtype=torch.float64), grid)
 
 
-def warm_up(method: Any, camera: Cameras) -> None:
+class _Trainable(Protocol):
+    optimiser: FieldOptimiser
+
+    def train_step(self, batch: PixelBatch, step: int) -> StepOutput: ...
+
+
+def warm_up(method: _Trainable, camera: Cameras) -> None:
     """Compiles the CPU kernels of a step, or loads them, on 16 pixels; the gradients are dropped."""
     log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
     origins, directions = (x.float() for x in spread_rays(camera, 4))
     n = len(origins)
-    batch = SimpleNamespace(
+    batch = PixelBatch(
         origins=origins,
         directions=directions,
         rgb=torch.rand(n, 3, generator=torch.Generator().manual_seed(0)),
         mask=torch.ones(n),
         radii=pixel_radius(camera).expand(n),
-        mask_known=None,
     )
-    sum(method.train_step(batch, 1).values()).backward()
+    method.train_step(batch, 1).total.backward()
     method.optimiser.adam.zero_grad(set_to_none=True)
 
 
-def photograph_on(background: Tensor, batch: Any, alpha: Tensor) -> Tensor:
+def photograph_on(background: Tensor, batch: PixelBatch, alpha: Tensor) -> Tensor:
     """What a batch of pixels should look like on `background` (n, 3); see `losses.composite`."""
     return composite(batch.rgb, batch.mask, background, alpha=alpha, mask_known=batch.mask_known)
 
 
-def silhouette_loss(alpha: Tensor, batch: Any) -> Tensor:
+def psnr_of(error: Tensor) -> Tensor:
+    """PSNR in dB of colours that are off by `error` (n, 3), a scalar without gradient, at most 100."""
+    return -10 * error.detach().square().mean().clamp_min(1e-10).log10()
+
+
+def silhouette_loss(alpha: Tensor, batch: PixelBatch) -> Tensor:
     """Binary cross entropy between opacity (n,) and mask, over the pixels whose mask is known."""
     return mask_loss(alpha, batch.mask, None if batch.mask_known is None else batch.mask_known.float())
 

@@ -16,6 +16,7 @@ from visdom_plugin.methods.fields.common import (
     export_mesh,
     mesh_density,
     photograph_on,
+    psnr_of,
     render_image,
     silhouette_loss,
     spread_rays,
@@ -38,6 +39,7 @@ from visdom_plugin.nerf.sampling.occupancy_grid import (
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
+from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
 HUBER_DELTA = 0.1  # Instant-NGP
 RAYS_AT_ONCE = 1 << 14
@@ -77,7 +79,6 @@ class Ingp:
             parts = [self._bound(*spread_rays(views.cameras[i].to(device)), hooks) for i in range(len(views))]
             rays = LocalRays(*(torch.cat(x) for x in zip(*parts, strict=True)))
             self.occupancy.restrict(rays.origins, rays.directions, rays.near, rays.far)
-        self.metrics: dict[str, float] = {}
         if device.type == "cpu":
             warm_up(self, views.cameras[0])
         self._rays = LEAST_RAYS
@@ -86,7 +87,7 @@ class Ingp:
         """Pixels the next batch should have."""
         return self._rays
 
-    def train_step(self, batch, step: int) -> dict[str, Tensor]:
+    def train_step(self, batch: PixelBatch, step: int) -> StepOutput:
         c = self.config
         draw = generator(self.seed, "step", step)
         if step % c.occupancy_every == 0:
@@ -101,14 +102,13 @@ class Ingp:
         samples = self._march(rays, rays.far, step_length, shift, self.hooks)
         rgb, alpha, _ = self._shade(rays, samples, background)
         target = photograph_on(background, batch, alpha)
-        self.metrics = {"psnr": float(-10 * (rgb.detach() - target).square().mean().clamp_min(1e-10).log10())}
         self._adapt(n, len(samples.ray))
         losses = {"colour": torch.nn.functional.huber_loss(rgb, target, delta=HUBER_DELTA) / HUBER_DELTA}
         if c.mask_weight:
             losses["mask"] = c.mask_weight * silhouette_loss(alpha, batch)
-        return losses
+        return StepOutput(losses, {"psnr": psnr_of(rgb - target)})
 
-    def optimise(self, step: int) -> None:
+    def optimise(self, step: int, output: StepOutput) -> None:
         c = self.config
         lr = warm_up_and_steps(
             step, c.steps, base=c.lr, warm_up=c.lr_warm_up, factor=c.lr_factor, at=(0.5, 0.75, 0.9)

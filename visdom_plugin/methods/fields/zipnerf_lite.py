@@ -17,6 +17,7 @@ from visdom_plugin.methods.fields.common import (
     export_mesh,
     mesh_density,
     photograph_on,
+    psnr_of,
     render_image,
     silhouette_loss,
     warm_up,
@@ -41,6 +42,7 @@ from visdom_plugin.nerf.sampling.step_functions import anneal, sample_edges
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
+from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
 RAYS_AT_ONCE = 1 << 12
 CHARBONNIER = 0.001  # Zip-NeRF
@@ -133,14 +135,13 @@ class ZipNerfLite:
         ).to(device)
         named = dict(self.model.named_parameters())
         self.optimiser = FieldOptimiser([(named, 0.0)], betas=(0.9, 0.99), eps=1e-15)
-        self.metrics: dict[str, float] = {}
         if device.type == "cpu":
             warm_up(self, views.cameras[0])
 
     def pixels_per_step(self, step: int) -> int:
         return self.config.rays
 
-    def train_step(self, batch, step: int) -> dict[str, Tensor]:
+    def train_step(self, batch: PixelBatch, step: int) -> StepOutput:
         c = self.config
         draw = generator(self.seed, "step", step)
         n = len(batch.mask)
@@ -153,7 +154,6 @@ class ZipNerfLite:
         rgb, alpha, _ = composite(last.weights, colours, last.t, background)
         target = photograph_on(background, batch, alpha)
         error = rgb - target
-        self.metrics = {"psnr": float(-10 * error.detach().square().mean().clamp_min(1e-10).log10())}
         losses = {"colour": (error.square() + CHARBONNIER**2).sqrt().mean()}
         if c.mask_weight:
             losses["mask"] = c.mask_weight * silhouette_loss(alpha, batch)
@@ -172,9 +172,9 @@ class ZipNerfLite:
         if c.hash_decay:
             grids = (self.model[name].decay() for name in LEVELS)
             losses["hash_decay"] = c.hash_decay * sum(grids)
-        return losses
+        return StepOutput(losses, {"psnr": psnr_of(error)})
 
-    def optimise(self, step: int) -> None:
+    def optimise(self, step: int, output: StepOutput) -> None:
         c = self.config
         self.optimiser.step(
             warm_up_and_decay(

@@ -19,21 +19,17 @@ from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.losses import photometric_loss
+from visdom_plugin.methods.splats.common import draw_background, fit_view, load_kernels, scene_extent
 from visdom_plugin.methods.splats.configs import CorgsConfig
 from visdom_plugin.methods.splats.initial_points import draw_box, draw_points
 from visdom_plugin.methods.splats.pseudo_views import draw_between, draw_on_ellipse, fit_ellipse
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
-from visdom_plugin.splat.model import (
-    GaussianSet,
-    draw_background,
-    fit_view,
-    load_kernels,
-    scene_extent,
-)
+from visdom_plugin.splat.model import GaussianSet
 from visdom_plugin.splat.ply import write_ply
 from visdom_plugin.splat.rasterise import rasterise
+from visdom_plugin.training.protocols import StepOutput, ViewBatch
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +63,7 @@ class CorgsLite:
         self.sets = [GaussianSet(c, xyz, rgb, extent=extent, device=device) for _ in range(2)]
         self.co_prune_distance = c.co_prune_extents * extent if c.co_prune_world is None else c.co_prune_world
 
-    def train_step(self, batch, step: int) -> dict[str, Tensor]:
+    def train_step(self, batch: ViewBatch, step: int) -> StepOutput:
         c, done = self.config, step + 1
         degree = min(c.sh_degree, step // c.sh_every)
         background = draw_background(c, generator(self.seed, "step", step), self.device)
@@ -76,12 +72,9 @@ class CorgsLite:
         def show(gaussians, camera: Cameras) -> Render:
             return rasterise(gaussians, camera, background, sh_degree=degree)
 
-        self._renders, losses = [show(gaussians, batch.camera) for gaussians in sets], {}
-        for i, render in enumerate(self._renders):
-            found, psnr = fit_view(render, batch, background, c)
-            losses |= _numbered(found, i)
-            if i == 0:
-                self.metrics = {"psnr": psnr}
+        renders = [show(gaussians, batch.camera) for gaussians in sets]
+        (losses, psnr), (others, _) = (fit_view(render, batch, background, c) for render in renders)
+        losses = _numbered(losses, 0) | _numbered(others, 1)
         if c.pseudo_every and c.pseudo_from <= done <= c.pseudo_until and done % c.pseudo_every == 0:
             camera = self.pseudo_camera(step)
             seen = [show(gaussians, camera).rgb for gaussians in sets]
@@ -92,7 +85,7 @@ class CorgsLite:
                 draw = generator(self.seed, "hook", h, step)
                 found = hook.loss(lambda camera, seen=gaussians: show(seen, camera), step, draw)
                 losses |= _numbered(found, i)
-        return losses
+        return StepOutput(losses, {"psnr": psnr}, renders)
 
     def pseudo_camera(self, step: int) -> Cameras:
         """The unseen view of a step, the same for both sets."""
@@ -102,16 +95,15 @@ class CorgsLite:
         return draw_between(self.cameras, self.look_at, draw)
 
     @torch.no_grad()
-    def optimise(self, step: int) -> None:
+    def optimise(self, step: int, output: StepOutput) -> None:
         c, done = self.config, step + 1
         since_reset = done - c.opacity_reset_from
-        for i, (one, render) in enumerate(zip(self.sets, self._renders, strict=True)):
+        for i, (one, render) in enumerate(zip(self.sets, output.renders, strict=True)):
             one.optimise(step, render)
             if c.densify_from < done < c.densify_until and done % c.densify_every == 0:
                 one.densify(generator(self.seed, "split", i, done))
             if c.opacity_reset_every and since_reset >= 0 and since_reset % c.opacity_reset_every == 0:
                 one.reset_opacity()
-        self._renders = None
         if c.co_prune_every and done > c.densify_from and done % c.co_prune_every == 0:
             self._co_prune(done)
         for one in self.sets:

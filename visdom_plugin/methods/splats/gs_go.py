@@ -15,21 +15,17 @@ from torch import Tensor
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.losses import disparity_loss
+from visdom_plugin.methods.splats.common import draw_background, fit_view, load_kernels, scene_extent
 from visdom_plugin.methods.splats.configs import GsGoConfig
 from visdom_plugin.methods.splats.initial_points import draw_points
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
 from visdom_plugin.splat.densify import stray_gaussians
-from visdom_plugin.splat.model import (
-    GaussianSet,
-    draw_background,
-    fit_view,
-    load_kernels,
-    scene_extent,
-)
+from visdom_plugin.splat.model import GaussianSet
 from visdom_plugin.splat.ply import write_ply
 from visdom_plugin.splat.rasterise import rasterise
+from visdom_plugin.training.protocols import StepOutput, ViewBatch
 
 
 class GsGo:
@@ -48,14 +44,13 @@ class GsGo:
         xyz, rgb = draw_points(self.hooks, hull, views, self.config.initial_points, draw)
         self.splats = GaussianSet(self.config, xyz, rgb, extent=scene_extent(views.cameras), device=device)
 
-    def train_step(self, batch, step: int) -> dict[str, Tensor]:
+    def train_step(self, batch: ViewBatch, step: int) -> StepOutput:
         c = self.config
         degree = min(c.sh_degree, step // c.sh_every)
         gaussians = self.splats.gaussians()
         background = draw_background(c, generator(self.seed, "step", step), self.device)
-        render = self._render = rasterise(gaussians, batch.camera, background, sh_degree=degree)
+        render = rasterise(gaussians, batch.camera, background, sh_degree=degree)
         losses, psnr = fit_view(render, batch, background, c)
-        self.metrics = {"psnr": psnr}
         if c.depth_weight and batch.mono_depth is not None and batch.mask_known:
             object_mask = batch.mask if batch.weight is None else batch.mask * batch.weight
             depth = disparity_loss(render.depth, render.alpha, batch.mono_depth, object_mask)
@@ -67,13 +62,12 @@ class GsGo:
                 step,
                 generator(self.seed, "hook", i, step),
             )
-        return losses
+        return StepOutput(losses, {"psnr": psnr}, [render])
 
     @torch.no_grad()
-    def optimise(self, step: int) -> None:
+    def optimise(self, step: int, output: StepOutput) -> None:
         c, done = self.config, step + 1
-        self.splats.optimise(step, self._render)
-        self._render = None
+        self.splats.optimise(step, output.renders[0])
         if done < c.densify_until:
             if done > c.densify_from and done % c.densify_every == 0:
                 large = (c.prune_radius_px, c.prune_scale) if done > c.prune_large_from else None

@@ -1,0 +1,54 @@
+"""What the splatting methods share: the losses of a training view, backgrounds, the scene's extent."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+from torch import Generator, Tensor
+
+from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.losses import composite, mask_loss, photometric_loss
+from visdom_plugin.render import Render
+from visdom_plugin.splat.cpu.backend import warm_up
+from visdom_plugin.splat.set_config import GaussianSetConfig
+from visdom_plugin.training.protocols import ViewBatch
+
+log = logging.getLogger(__name__)
+
+
+def fit_view(
+    render: Render, batch: ViewBatch, background: Tensor, config: GaussianSetConfig
+) -> tuple[dict[str, Tensor], Tensor]:
+    """How far the render of a training view is from its photograph on the same background.
+
+    Returns:
+        Weighted losses by name, and the PSNR in dB, a scalar without gradient.
+    """
+    weight = batch.weight
+    target = composite(batch.image, batch.mask, background, alpha=render.alpha, mask_known=batch.mask_known)
+    errors = (render.rgb.detach() - target).square()
+    mse = errors.mean() if weight is None else (errors.mean(-1) * weight).sum() / weight.sum().clamp_min(1)
+    losses = {"photometric": photometric_loss(render.rgb, target, config.ssim_weight, weight)}
+    if config.mask_weight and batch.mask_known:
+        losses["mask"] = config.mask_weight * mask_loss(render.alpha, batch.mask, weight)
+    return losses, -10 * mse.clamp_min(1e-10).log10()
+
+
+def draw_background(config: GaussianSetConfig, generator: Generator, device: torch.device) -> Tensor:
+    """(3,) the training background of a step."""
+    background = torch.rand(3, generator=generator) if config.background == "random" else torch.ones(3)
+    return background.to(device)
+
+
+def load_kernels(device: torch.device) -> None:
+    """Compiles the CPU rasteriser ahead of the first step, and says so."""
+    if device.type == "cpu":
+        log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
+        warm_up()
+
+
+def scene_extent(cameras: Cameras) -> float:
+    """1.1 x the farthest camera from the cameras' mean, in scene units (3DGS). Training cameras only."""
+    centres = cameras.centres
+    return float(1.1 * (centres - centres.mean(0)).norm(dim=-1).max())
