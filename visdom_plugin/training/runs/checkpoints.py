@@ -11,8 +11,8 @@ from typing import Any
 
 from torch import Tensor
 
-from visdom_plugin.errors import CheckpointError
 from visdom_plugin.atomic_files import write_bytes, write_json
+from visdom_plugin.errors import CheckpointError
 
 KEPT = 2
 """The newest states are kept; the one before the last is there in case the last is damaged."""

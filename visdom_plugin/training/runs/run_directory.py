@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from visdom_plugin.atomic_files import MARK, remove_parts, write_bytes, write_json
 from visdom_plugin.errors import CheckpointError
 from visdom_plugin.scene import Scene, Views
 from visdom_plugin.training.runs.checkpoints import list_steps
-from visdom_plugin.atomic_files import MARK, remove_parts, write_bytes, write_json
 from visdom_plugin.training.runs.config_io import as_plain, differences
 
 log = logging.getLogger(__name__)
