@@ -5,7 +5,7 @@ from __future__ import annotations
 __all__ = ["load"]
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> object:
     # Lazy: importing the package must not import torch.
     if name == "load":
         from datamodules.recognise import load

@@ -11,8 +11,9 @@ from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from datamodules.capture import Capture
 from datamodules.files.paths import inside, read_plain
-from datamodules.open_scene import Capture, Chosen, choose_files
+from datamodules.open_scene import Chosen, choose_files
 from datamodules.recognise import opening, read_capture
 from datamodules.request import Request
 from datamodules.views.reader import spread_out

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,7 +14,7 @@ from datamodules.request import Request
 from visdom_plugin.errors import ConfigError, SceneError
 
 if TYPE_CHECKING:
-    from datamodules.open_scene import Capture
+    from datamodules.capture import Capture
     from visdom_plugin.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -84,12 +85,13 @@ def load(
     request = Request(views=views, downscale=downscale, test=test, **reading)
     _check_format(data_format)
     if path is None:
-        from datamodules.synthetic.scene import SyntheticConfig, make_scene
+        from datamodules.synthetic.config import SyntheticConfig
+        from datamodules.synthetic.scene import make_scene
 
-        wanted = {} if views is None else {"train_views": views}
-        return make_scene(
-            SyntheticConfig(downscale=downscale, seed=seed, **wanted, **({} if test else {"test_views": 0}))
-        )
+        config = SyntheticConfig(downscale=downscale, seed=seed)
+        if views is not None:
+            config = replace(config, train_views=views)
+        return make_scene(config if test else replace(config, test_views=0))
     from datamodules.open_scene import open_capture
 
     with opening(path) as root:

@@ -7,17 +7,17 @@ that are there before anything is allocated, so a damaged file costs no more mem
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
-from datamodules.files.images import MAX_PIXELS
 from datamodules.files.parsers import damaged
 from datamodules.files.paths import inside, read_inside
+from datamodules.files.pinholes import pinholes
 from datamodules.files.undistort import COEFFICIENTS, Distortion
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras
@@ -34,6 +34,7 @@ MODELS = {
 FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}
 """Of the models that can be undistorted, those whose parameters begin f, cx, cy and not fx, fy, cx, cy."""
+_T = TypeVar("_T")
 _UNDISTORT = "undistort: colmap image_undistorter --image_path images --input_path sparse/0 --output_path DIR"
 
 
@@ -128,7 +129,13 @@ def cameras_of(model: Model, images: Sequence[Registered]) -> tuple[Cameras, lis
         matrix, distortion = _lens(lens, image.name, model.folder)
         K.append(matrix)
         distortions.append(distortion)
-        _check_pose(image, model.folder)
+        if max(map(abs, image.quaternion)) < 1e-150:
+            raise SceneError(
+                f"the quaternion of image {image.name} is zero, which is no rotation",
+                where=model.folder,
+                cause="a pose that was never filled in",
+                todo="drop the view from the model and the index files, or estimate its pose again",
+            )
         rotations.append(image.quaternion)
         translations.append(image.translation)
     quaternion = torch.tensor(rotations, dtype=torch.float64).reshape(-1, 4)
@@ -137,16 +144,17 @@ def cameras_of(model: Model, images: Sequence[Registered]) -> tuple[Cameras, lis
     rotation = matrix_from_quaternion(quaternion).mT
     centre = -(rotation @ torch.tensor(translations, dtype=torch.float64).reshape(-1, 3, 1))
     lenses = [model.cameras[image.camera_id] for image in images]
-    cameras = Cameras.from_matrices(
-        torch.tensor(K, dtype=torch.float64).reshape(-1, 3, 3),
-        torch.cat([rotation, centre], -1),
-        width=torch.tensor([lens.width for lens in lenses], dtype=torch.int64),
-        height=torch.tensor([lens.height for lens in lenses], dtype=torch.int64),
+    cameras = pinholes(
+        K,
+        torch.cat([rotation, centre], -1).numpy(),
+        [(lens.width, lens.height) for lens in lenses],
+        names=[image.name for image in images],
+        where=model.folder,
     )
     return cameras, distortions
 
 
-def _lens(lens: Intrinsics, name: str, folder: Path) -> tuple[list[list[float]], Distortion | None]:
+def _lens(lens: Intrinsics, name: str, folder: Path) -> tuple[tuple[float, ...], Distortion | None]:
     if lens.model not in COEFFICIENTS:
         known = lens.model in dict(MODELS.values())
         raise SceneError(
@@ -161,37 +169,8 @@ def _lens(lens: Intrinsics, name: str, folder: Path) -> tuple[list[list[float]],
         fy = fx
     else:
         fx, fy, cx, cy, *rest = lens.params
-    size_ok = lens.width > 0 and lens.height > 0 and lens.width * lens.height <= MAX_PIXELS
-    finite = all(map(math.isfinite, lens.params)) and max(map(abs, lens.params)) < 1e9
-    if not size_ok or not finite or min(fx, fy) < 1e-6:
-        raise SceneError(
-            f"the camera of image {name} is impossible: {lens.width} x {lens.height} pixels, focal lengths "
-            f"{fx:g} and {fy:g}, principal point ({cx:g}, {cy:g})",
-            where=folder,
-            cause="a damaged file, or a calibration that failed",
-            todo="export the model again",
-        )
     distortion = Distortion(lens.model, tuple(rest))
-    return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], None if distortion.absent else distortion
-
-
-def _check_pose(image: Registered, folder: Path) -> None:
-    numbers = (*image.quaternion, *image.translation)
-    # Beyond 1e15 scene units float32 arithmetic on squared distances overflows.
-    if not all(math.isfinite(x) for x in numbers) or max(map(abs, image.translation)) > 1e15:
-        raise SceneError(
-            f"the pose of image {image.name} holds NaN, infinite or absurd numbers",
-            where=folder,
-            cause="the pose estimation failed for this view, or the file is damaged",
-            todo="drop the view from the model and the index files, or estimate its pose again",
-        )
-    if max(map(abs, image.quaternion)) < 1e-150:
-        raise SceneError(
-            f"the quaternion of image {image.name} is zero, which is no rotation",
-            where=folder,
-            cause="a pose that was never filled in",
-            todo="drop the view from the model and the index files, or estimate its pose again",
-        )
+    return (fx, fy, cx, cy), None if distortion.absent else distortion
 
 
 class ByteReader:
@@ -237,7 +216,8 @@ class ByteReader:
 
 def parse_cameras_binary(data: bytes, path: Path) -> dict[int, Intrinsics]:
     """Of cameras.bin, by id."""
-    file, cameras = ByteReader(data, path), {}
+    file = ByteReader(data, path)
+    cameras: dict[int, Intrinsics] = {}
     for _ in range(file.count(24 + 16)):
         camera_id, model_id, width, height = file.take("<IiQQ")
         if model_id not in MODELS:
@@ -254,17 +234,18 @@ def parse_cameras_binary(data: bytes, path: Path) -> dict[int, Intrinsics]:
 
 def parse_images_binary(data: bytes, path: Path) -> list[Registered]:
     """Of images.bin, in its order; 2D points are passed over."""
-    file, images = ByteReader(data, path), {}
+    file = ByteReader(data, path)
+    images: dict[int, Registered] = {}
     for _ in range(file.count(4 + 56 + 4 + 1 + 8)):
-        image_id, *pose, camera_id = file.take("<I7dI")
+        image_id, qw, qx, qy, qz, tx, ty, tz, camera_id = file.take("<I7dI")
         name = file.string()
         file.skip(file.count(24) * 24)
-        _add(images, image_id, Registered(name, tuple(pose[:4]), tuple(pose[4:]), camera_id), path)
+        _add(images, image_id, Registered(name, (qw, qx, qy, qz), (tx, ty, tz), camera_id), path)
     file.finish()
     return list(images.values())
 
 
-def _add(table: dict, key: int, value, path: Path) -> None:
+def _add(table: dict[int, _T], key: int, value: _T, path: Path) -> None:
     if key in table:
         damaged(path, f"{path.name} lists the id {key} twice", cause="a damaged or badly merged file")
     table[key] = value
@@ -313,7 +294,7 @@ def parse_images_text(data: bytes, path: Path) -> list[Registered]:
         fields = line.strip().split(maxsplit=9)
         try:
             image_id, camera_id, name = int(fields[0]), int(fields[8]), fields[9]
-            pose = tuple(map(float, fields[1:8]))
+            qw, qx, qy, qz, tx, ty, tz = map(float, fields[1:8])
         except (IndexError, ValueError):
             damaged(
                 path,
@@ -329,5 +310,5 @@ def parse_images_text(data: bytes, path: Path) -> list[Registered]:
                     f"line {number} is not the list of 2D points of image {name}",
                     cause="the second line of an image (its points, often empty) was removed",
                 )
-        _add(images, image_id, Registered(name, pose[:4], pose[4:], camera_id), path)
+        _add(images, image_id, Registered(name, (qw, qx, qy, qz), (tx, ty, tz), camera_id), path)
     return list(images.values())

@@ -7,20 +7,18 @@ with grey and say nothing.
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
 
 from datamodules.files.paths import read_plain
 from visdom_plugin.errors import SceneError
 
 MAX_PIXELS = 2**28
-_PNG = b"\x89PNG\r\n\x1a\n"
-# Start-of-frame markers of JPEG: all of 0xC0..0xCF but DHT (C4), JPG (C8) and DAC (CC).
-_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def read_file(path: Path) -> bytes:
@@ -43,23 +41,49 @@ def read_file(path: Path) -> bytes:
         ) from error
 
 
-def size_of(data: bytes, path: Path) -> tuple[int, int]:
-    """Width and height in pixels from the header of a complete PNG or JPEG.
+class Header(NamedTuple):
+    """What an image file says of itself before its pixels are decoded."""
+
+    size: tuple[int, int]
+    """Width and height in pixels, as stored."""
+    alpha: bool
+    """Whether it promises transparency: an alpha channel, a transparent colour, a palette's transparency."""
+
+
+def read_header(data: bytes, path: Path) -> Header:
+    """The header of a complete PNG or JPEG; no pixel is decoded.
 
     Raises:
         SceneError: another format, a damaged header or chunk, or a file that stops before its end.
     """
-    if data.startswith((_PNG, b"\xff\xd8")):
-        width, height = (_png_size if data.startswith(_PNG) else _jpeg_size)(data, path)
-        if not 0 < width * height <= MAX_PIXELS:
-            _damaged(path, f"the image claims to be {width} x {height}")
-        return width, height
-    raise SceneError(
-        "the file is neither PNG nor JPEG" if data else "the file is empty",
-        where=path,
-        cause="another format behind this extension, or an interrupted copy",
-        todo="convert it to PNG or JPEG, or copy it again",
-    )
+    png = data.startswith(b"\x89PNG\r\n\x1a\n")
+    if not png and not data.startswith(b"\xff\xd8"):
+        raise SceneError(
+            "the file is neither PNG nor JPEG" if data else "the file is empty",
+            where=path,
+            cause="another format behind this extension, or an interrupted copy",
+            todo="convert it to PNG or JPEG, or copy it again",
+        )
+    stream = io.BytesIO(data)
+    try:
+        image = (PngImageFile if png else JpegImageFile)(stream)
+        width, height = image.size
+        complete = data.rfind(b"IEND\xaeB`\x82" if png else b"\xff\xd9") >= stream.tell()
+        if png:
+            image.verify()  # walks the chunks to the last one and compares their checksums
+    except Exception as error:  # Pillow raises whatever it comes across
+        _damaged(
+            path, f"the {'PNG' if png else 'JPEG'} is damaged, or stops before its end: {str(error)[:120]}"
+        )
+    if not complete:
+        _damaged(path, f"the {'PNG' if png else 'JPEG'} stops before its end")
+    # Deflate makes at most 1032 bytes of one, and a JPEG's block of 8 x 8 pixels takes at least one bit: a
+    # larger claim is a bomb, or a damaged header.
+    most = len(data) * (8 * 1032 // max(1, data[24] * len(image.getbands())) if png else 512)
+    if not 0 < width * height <= min(MAX_PIXELS, most):
+        _damaged(path, f"the image claims to be {width} x {height} but holds {len(data)} bytes")
+    alpha = "transparency" in image.info or image.mode in ("LA", "PA", "RGBA")
+    return Header((width, height), alpha)
 
 
 def decode_photograph(data: bytes, path: Path) -> np.ndarray:
@@ -70,16 +94,6 @@ def decode_photograph(data: bytes, path: Path) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def decode_mask(data: bytes, path: Path) -> np.ndarray:
-    """(H, W) float32 in [0, 1] from any bit depth.
-
-    An alpha channel that varies is the mask; else the brightest colour channel is.
-    """
-    from datamodules.files import masks
-
-    return masks.decode(data, path).opacity
-
-
 def decode_any(data: bytes, path: Path) -> np.ndarray:
     """(H, W) or (H, W, C) as stored, uint8 or uint16; colours as BGR or BGRA, palettes and 1 bit spread out.
 
@@ -87,22 +101,11 @@ def decode_any(data: bytes, path: Path) -> np.ndarray:
     """
     import cv2
 
-    return _decode(data, path, cv2.IMREAD_UNCHANGED)
-
-
-def has_alpha(data: bytes) -> bool:
-    """Whether a PNG promises transparency; False for everything else."""
-    return data.startswith(_PNG) and len(data) > 25 and (data[25] in (4, 6) or b"tRNS" in data[:2048])
-
-
-def decode_alpha(data: bytes, path: Path) -> np.ndarray | None:
-    """(H, W) float32 in [0, 1], the alpha channel of a photograph; None where it has none or it never varies."""
-    from datamodules.files import masks
-
-    if not has_alpha(data):
-        return None
-    found = masks.decode_alpha(decode_any(data, path))
-    return None if found is None else found.opacity
+    image = _decode(data, path, cv2.IMREAD_UNCHANGED)
+    if image.ndim == 2 and image.dtype == np.uint8 and read_header(data, path).alpha:
+        # OpenCV passes over the transparent level of a grey picture.
+        return np.asarray(PngImageFile(io.BytesIO(data)).convert("LA"))
+    return image
 
 
 def decode_depth(data: bytes, path: Path) -> np.ndarray:
@@ -159,55 +162,6 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
     if image is None:
         _damaged(path, "the image cannot be decoded")
     return image
-
-
-def _png_size(data: bytes, path: Path) -> tuple[int, int]:
-    """Walks the chunks, checks each one's CRC (PNG specification, section 5) and that IEND is reached."""
-    at, size, packed = len(_PNG), None, 0
-    while True:
-        if at + 12 > len(data):
-            _damaged(path, "the PNG stops before its end")
-        (length,), kind = struct.unpack_from(">I", data, at), data[at + 4 : at + 8]
-        if at + 12 + length > len(data):
-            _damaged(path, "the PNG stops before its end")
-        (crc,) = struct.unpack_from(">I", data, at + 8 + length)
-        if crc != zlib.crc32(memoryview(data)[at + 4 : at + 8 + length]):
-            _damaged(path, f"the PNG's chunk {kind.decode('latin-1')!r} has a wrong checksum")
-        if size is None:
-            if kind != b"IHDR" or length != 13:
-                _damaged(path, "the PNG does not begin with its header")
-            size = struct.unpack_from(">II", data, at + 8)
-            bits = data[at + 16] * {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(data[at + 17], 4)
-        packed += length if kind == b"IDAT" else 0
-        if kind == b"IEND":
-            # Deflate makes at most 1032 bytes of one: a larger claim is a bomb, or a damaged header.
-            if size[1] * (size[0] * bits // 8) > 1032 * packed:
-                _damaged(path, f"the image claims to be {size[0]} x {size[1]} but holds {packed} bytes")
-            return size
-        at += 12 + length
-
-
-def _jpeg_size(data: bytes, path: Path) -> tuple[int, int]:
-    """Walks the segments to the start of frame (ITU-T T.81, annex B) and looks for the end marker."""
-    at = 2
-    while at + 4 <= len(data):
-        if data[at] != 0xFF:
-            _damaged(path, "the JPEG's header is damaged")
-        marker = data[at + 1]
-        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:
-            at += 1 if marker == 0xFF else 2
-            continue
-        if marker in _FRAMES and at + 9 <= len(data):
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            if data.rfind(b"\xff\xd9") < at:
-                _damaged(path, "the JPEG stops before its end")
-            # A block of 8 x 8 pixels takes at least one bit.
-            if width * height > 512 * len(data):
-                _damaged(path, f"the image claims to be {width} x {height} but holds {len(data)} bytes")
-            return width, height
-        (length,) = struct.unpack_from(">H", data, at + 2)
-        at += 2 + max(length, 2)
-    _damaged(path, "the JPEG stops inside its header")
 
 
 def _damaged(path: Path, what: str) -> NoReturn:

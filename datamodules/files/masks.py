@@ -38,7 +38,7 @@ def fits(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return low <= high and max(size) <= MOST_ENLARGED * max(other)
 
 
-def decode(data: bytes, path: Path) -> Mask:
+def decode_mask(data: bytes, path: Path) -> Mask:
     """A foreground mask from L, LA, RGB, RGBA, palette, 1-bit, 8-bit or 16-bit PNG or JPEG.
 
     Its alpha channel is the mask where it varies, else its brightest colour channel is.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -63,7 +64,7 @@ def load_mesh(path: Path, box: list[list[float]] | None = None) -> tuple[Tensor,
     path = Path(path)
     try:
         data = io.BytesIO(read_plain(path))
-        mesh = trimesh.load(data, file_type=path.suffix.lower().lstrip("."), process=False, force="mesh")
+        mesh: Any = trimesh.load(data, file_type=path.suffix.lower().lstrip("."), process=False, force="mesh")
         # Files of some kinds name each triangle's corners anew.
         mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
         mesh.merge_vertices(merge_tex=True, merge_norm=True)

@@ -56,7 +56,7 @@ class Distortion:
                 "--output_path DIR",
             )
         expected = COEFFICIENTS[self.model]
-        if len(self.coefficients) != expected or not all(map(math.isfinite, self.coefficients)):
+        if len(self.coefficients) != expected or not all(abs(c) < 1e9 for c in self.coefficients):
             raise SceneError(
                 f"the lens model {self.model} needs {expected} finite coefficients, not {self.coefficients}",
                 where=where,
@@ -68,7 +68,7 @@ class Distortion:
 class Undistorted(NamedTuple):
     """A photograph as a pinhole camera of the same intrinsics would have taken it."""
 
-    image: np.ndarray | None
+    image: np.ndarray
     """(H, W, ...) as the input, interpolated bilinearly; the photograph's edge repeated where ignored."""
     mask: np.ndarray | None
     """(H, W) type of the input, nearest pixel; False or 0 where ignored."""
@@ -79,7 +79,7 @@ class Undistorted(NamedTuple):
 def undistort(
     intrinsics: np.ndarray,
     distortion: Distortion,
-    image: np.ndarray | None,
+    image: np.ndarray,
     mask: np.ndarray | None = None,
     ignore: np.ndarray | None = None,
     *,
@@ -91,7 +91,7 @@ def undistort(
         intrinsics: (3, 3) pixels of these very arrays (scaled with them), origin at the image's corner as
             everywhere here: the first pixel's centre is (0.5, 0.5).
         distortion: of the lens.
-        image: (H, W) or (H, W, C), uint8, uint16 or float32; None where only the mask is wanted.
+        image: (H, W) or (H, W, C), uint8, uint16 or float32.
         mask: (H, W) bool, uint8 or float32, or None.
         ignore: (H, W) bool, or None.
         where: the file or view, for messages.
@@ -105,8 +105,7 @@ def undistort(
     distortion.check(where)
     if distortion.absent:
         return Undistorted(image, mask, ignore)
-    given = [a for a in (image, mask, ignore) if a is not None]
-    height, width = given[0].shape[:2]
+    height, width = image.shape[:2]
     columns, rows, lost = _find_sources(np.asarray(intrinsics, np.float64), distortion, width, height)
     if lost.mean() > 1 - LEAST_KEPT:
         raise SceneError(
@@ -125,15 +124,15 @@ def undistort(
 
     unknown = lost if ignore is None else lost | nearest(np.ascontiguousarray(ignore, bool))
     return Undistorted(
-        None
-        if image is None
-        else cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+        cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
         None if mask is None else nearest(np.ascontiguousarray(mask)),
         unknown if unknown.any() else None,
     )
 
 
-def _find_sources(K: np.ndarray, distortion: Distortion, width: int, height: int):
+def _find_sources(
+    K: np.ndarray, distortion: Distortion, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where each corrected pixel lies in the photograph.
 
     Returns:

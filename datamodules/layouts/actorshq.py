@@ -28,9 +28,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from datamodules.capture import Calibration, Capture, Frame, Pools
 from datamodules.files.parsers import csv_number, damaged, parse_csv, parse_npy, size
 from datamodules.files.paths import check_name, inside, read_inside
-from datamodules.open_scene import Calibration, Capture, Frame, pinholes
+from datamodules.files.pinholes import pinholes
 from datamodules.request import Request
 from datamodules.views import splits
 from visdom_plugin.errors import SceneError
@@ -101,12 +102,12 @@ def read(root: Path, request: Request) -> Capture:
     )
 
 
-def hold_out(rows: Sequence[int]) -> splits.Pools:
+def hold_out(rows: Sequence[int]) -> Pools:
     """30 of 160 cameras for testing, evenly spread, in proportion for fewer; the others may train."""
     count = min(round(len(rows) * _HELD_OUT / _ALL), _HELD_OUT)
     test = splits.spread(rows, count) if count else []
     rule = f"{count} of {len(rows)} cameras held out, evenly spread"
-    return splits.Pools(tuple(i for i in rows if i not in set(test)), tuple(test), rule)
+    return Pools(tuple(i for i in rows if i not in set(test)), tuple(test), rule)
 
 
 def parse_calibration(data: bytes, path: Path) -> list[dict]:

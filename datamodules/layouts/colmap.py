@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
+from datamodules.capture import Calibration, Capture, Frame, sort_frames
 from datamodules.files import colmap_model
 from datamodules.files.paths import check_name, stem
-from datamodules.open_scene import Calibration, Capture, Frame, sort_frames
 from datamodules.request import Request
 from datamodules.views import splits
 from visdom_plugin.errors import SceneError

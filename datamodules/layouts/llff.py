@@ -14,9 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from datamodules.capture import Calibration, Capture, Frame, sort_frames
 from datamodules.files.parsers import damaged, parse_npy
 from datamodules.files.paths import check_name, inside, read_inside
-from datamodules.open_scene import Calibration, Capture, Frame, pinholes, sort_frames
+from datamodules.files.pinholes import pinholes
 from datamodules.request import Request
 from datamodules.views import splits
 from visdom_plugin.errors import SceneError

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from datamodules.capture import Capture
 from datamodules.layouts import colmap
-from datamodules.open_scene import Capture
 from datamodules.request import Request
 
 

@@ -16,10 +16,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from datamodules.capture import Capture
 from datamodules.files import colmap_model
 from datamodules.files.paths import inside
 from datamodules.layouts import colmap, llff, transforms
-from datamodules.open_scene import Capture
 from datamodules.request import Request
 from visdom_plugin.errors import SceneError
 

@@ -19,11 +19,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from datamodules.capture import Calibration, Capture, Frame, Pools, sort_frames
 from datamodules.files import images
 from datamodules.files.parsers import damaged, matrix, number, parse_json, size, text
 from datamodules.files.paths import check_name, inside, printable, read_inside
+from datamodules.files.pinholes import pinholes
 from datamodules.files.undistort import Distortion
-from datamodules.open_scene import Calibration, Capture, Frame, pinholes, sort_frames
 from datamodules.request import Request
 from datamodules.views import splits
 from visdom_plugin.errors import SceneError
@@ -120,15 +121,15 @@ def _entry(frame: Any, index: int, content: dict[str, Any], path: Path) -> Entry
             f"frame {index} has a rolling shutter, which cannot be used",
             cause="a video, not photographs",
         )
-    dimensions = [frame.get(key, content.get(key)) for key in ("w", "h")]
-    if (dimensions[0] is None) != (dimensions[1] is None):
+    width, height = (frame.get(key, content.get(key)) for key in ("w", "h"))
+    if (width is None) != (height is None):
         damaged(path, f"only one of w and h {what} is given")
     given = {key: frame.get(key) for key in ("mask_path", "depth_file_path")}
     return Entry(
         _normalise(text(frame.get("file_path"), f"file_path {what}", path)),
         matrix(frame.get("transform_matrix"), f"transform_matrix {what}", path),
         _numbers(frame, _LENS, path),
-        None if dimensions[0] is None else tuple(size(d, f"w or h {what}", path) for d in dimensions),
+        None if width is None else (size(width, f"w {what}", path), size(height, f"h {what}", path)),
         _distortion(content | frame, what, path),
         *(
             None if value is None else _normalise(text(value, f"{key} {what}", path))
@@ -259,7 +260,7 @@ def _frame(root: Path, name: str, entry: Entry, request: Request) -> Frame:
     return frame
 
 
-def _pools(frames: Sequence[Frame], of_name: dict, files: Sequence[Transforms]) -> splits.Pools:
+def _pools(frames: Sequence[Frame], of_name: dict, files: Sequence[Transforms]) -> Pools:
     if len(files) > 1:
         test = tuple(i for i, frame in enumerate(frames) if of_name[frame.name][2] == 1)
         rule = f"{files[0].path.name} and {files[1].path.name}"
@@ -274,15 +275,17 @@ def _pools(frames: Sequence[Frame], of_name: dict, files: Sequence[Transforms]) 
     if len(files) == 1 and files[0].train is not None:
         listed = set(files[0].train)
         train = [i for i in train if of_name[frames[i].name][1].file_path in listed]
-    return splits.Pools(tuple(train), test, rule)
+    return Pools(tuple(train), test, rule)
 
 
-def _lens(root: Path, frame: Frame, file: Transforms, entry: Entry, request: Request):
+def _lens(
+    root: Path, frame: Frame, file: Transforms, entry: Entry, request: Request
+) -> tuple[tuple[float, float, float, float], tuple[int, int]]:
     """(fx, fy, cx, cy) in pixels and (width, height); the size is the photograph's where none is given."""
     dimensions = entry.size
     if dimensions is None:
         path = inside(root, frame.image, outside=request.allow_outside)
-        dimensions = images.size_of(images.read_file(path), path)
+        dimensions = images.read_header(images.read_file(path), path).size
     both = {**file.shared, **entry.own}
     focal = _focal(entry.own, dimensions) or _focal(file.shared, dimensions)
     if focal is None:
@@ -314,7 +317,7 @@ def _focal(scope: dict[str, float], dimensions: tuple[int, int]) -> tuple[float,
             else of_angle(scope[key] * radians, pixels)
             for key, pixels in zip(keys, dimensions, strict=True)
         ]
-        if found != [None, None]:
-            fx, fy = found
-            return (fy if fx is None else fx), (fx if fy is None else fy)
+        given = [value for value in found if value is not None]
+        if given:
+            return given[0], given[-1]
     return None

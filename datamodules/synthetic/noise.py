@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from datamodules.synthetic.config import SyntheticConfig
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.geometry.rotations import matrix_from_quaternion
 from visdom_plugin.seeding import generator
-
-if TYPE_CHECKING:
-    from datamodules.synthetic.scene import SyntheticConfig
 
 
 def disturb_poses(cameras: Cameras, config: SyntheticConfig) -> Cameras:

@@ -85,7 +85,7 @@ def paint_room(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return room + edge[:, None].astype(np.float32) * (_table(x, y) - room)
 
 
-def _room(dx, dy, dz) -> np.ndarray:
+def _room(dx: np.ndarray, dy: np.ndarray, dz: np.ndarray) -> np.ndarray:
     height = np.clip(0.5 + 0.9 * dz, 0, 1)[:, None]
     low, high = np.array([0.34, 0.28, 0.25], np.float32), np.array([0.62, 0.72, 0.78], np.float32)
     glow = (
@@ -97,7 +97,7 @@ def _room(dx, dy, dz) -> np.ndarray:
     return np.clip(low + height * (high - low) + glow[:, None] * tint, 0, 1).astype(np.float32)
 
 
-def _table(x, y) -> np.ndarray:
+def _table(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     plank = np.floor(2.4 * x)
     tone = 0.07 * wave(plank * np.float32(0.37)) + 0.05 * wave(plank * np.float32(0.173) + 0.2)
     grain = wave(6.5 * x + 0.8 * wave(0.9 * y + plank * np.float32(0.31))) * (

@@ -58,7 +58,9 @@ def rasterise(uv: np.ndarray, depth: np.ndarray, faces: np.ndarray, width: int, 
     return Fragments(sample[seen], face[seen], weights[seen] / nearness[seen, None])
 
 
-def _spans(uv, faces, front, width, height):
+def _spans(
+    uv: np.ndarray, faces: np.ndarray, front: np.ndarray, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Face, line, first and one-past-last column of every span of the given faces inside the grid."""
     corners = faces[front]
     # Sorted by (v, u): an edge then runs the same way in both of its triangles.
@@ -81,6 +83,6 @@ def _spans(uv, faces, front, width, height):
     return front[triangle[some]], line[some], left[some], right[some]
 
 
-def _crossing(uv, start, end, line) -> np.ndarray:
+def _crossing(uv: np.ndarray, start: np.ndarray, end: np.ndarray, line: np.ndarray) -> np.ndarray:
     (u0, v0), (u1, v1) = uv[start].T, uv[end].T
     return u0 + (line + 0.5 - v0) * ((u1 - u0) / (v1 - v0))

@@ -7,16 +7,27 @@ principal point, some of which cut a piece off, so that the hull depends on K.
 
 from __future__ import annotations
 
+import functools
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 
-from visdom_plugin.errors import ConfigError
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
 
-if TYPE_CHECKING:
-    from visdom_plugin.scene import Scene
+from datamodules.hashing import hash_parts
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.noise import disturb_masks, disturb_poses
+from datamodules.synthetic.paint import paint_object, paint_room
+from datamodules.synthetic.render import rasterise
+from datamodules.synthetic.shape import Shape, watering_can
+from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.cameras import Cameras, project
+from visdom_plugin.scene import Scene, Views
 
-_MOST_VIEWS = 16
 _CENTRE = (1.7, -0.9, 0.6)
 _SCALE = 1.3
 _YAW = 0.6
@@ -45,71 +56,6 @@ _TRAIN = (
 )
 
 
-@dataclass(frozen=True)
-class SyntheticConfig:
-    """The built-in scene's knobs. Noise goes to the training views only; test views stay exact."""
-
-    size: int | tuple[int, int] = 200
-    """Width and height of the photographs in pixels before `downscale`; one number for a square."""
-    train_views: int = 4
-    """2 to 16; fewer views are the first of more."""
-    test_views: int = 16
-    """0 or more."""
-    downscale: float = 1.0
-    """>= 1: the photographs come out at round(size / downscale)."""
-    rotation_noise_deg: float = 0.0
-    """Standard deviation of the error in each training camera's orientation."""
-    translation_noise: float = 0.0
-    """Standard deviation of the error in each training camera's position, as a fraction of its distance."""
-    erode_px: int = 0
-    """Training masks lose this many pixels at their edges."""
-    dilate_px: int = 0
-    """Training masks gain this many pixels at their edges, after the erosion."""
-    flip_fraction: float = 0.0
-    """Fraction of the training masks' pixels that are turned over at random."""
-    truncation: float = 0.0
-    """In [0, 1): every other training view is shifted sideways until about this fraction of the object's
-    width lies outside the frame."""
-    background: Literal["room", "white", "black"] = "room"
-    """What the photographs show behind the object."""
-    seed: int = 0
-    """Of the noise."""
-
-    @property
-    def frame(self) -> tuple[int, int]:
-        """Width and height in pixels, after `downscale`."""
-        size = (self.size, self.size) if isinstance(self.size, int) else self.size
-        width, height = (max(1, round(s / self.downscale)) for s in size)
-        return width, height
-
-    def check(self) -> None:
-        """Raises ConfigError for a field out of its range."""
-        downscale_fine = math.isfinite(self.downscale) and self.downscale >= 1
-        checks = (
-            ("downscale", downscale_fine, "1 or more"),
-            (
-                "size",
-                not downscale_fine or 8 <= min(self.frame) <= max(self.frame) <= 8192,
-                "8 to 8192 pixels",
-            ),
-            ("train_views", 2 <= self.train_views <= _MOST_VIEWS, f"2 to {_MOST_VIEWS}"),
-            ("test_views", 0 <= self.test_views <= 360, "0 to 360"),
-            ("rotation_noise_deg", 0 <= self.rotation_noise_deg <= 180, "0 to 180"),
-            ("translation_noise", 0 <= self.translation_noise <= 1, "0 to 1"),
-            ("erode_px", 0 <= self.erode_px <= 1000, "0 to 1000"),
-            ("dilate_px", 0 <= self.dilate_px <= 1000, "0 to 1000"),
-            ("flip_fraction", 0 <= self.flip_fraction <= 1, "0 to 1"),
-            ("truncation", 0 <= self.truncation < 1, "0 to less than 1"),
-            ("background", self.background in ("room", "white", "black"), "room, white or black"),
-        )
-        for name, fine, allowed in checks:
-            if not fine:
-                raise ConfigError(
-                    f"the built-in scene's {name} is {getattr(self, name)!r}; it must be {allowed}",
-                    where=name,
-                )
-
-
 def make_scene(config: SyntheticConfig | None = None) -> Scene:
     """Draws the built-in scene; the same pictures, bit for bit, for the same config.
 
@@ -120,16 +66,6 @@ def make_scene(config: SyntheticConfig | None = None) -> Scene:
     Raises:
         ConfigError: a field of the config is out of range.
     """
-    from dataclasses import asdict
-
-    import torch
-
-    from datamodules.open_scene import hash_views
-    from datamodules.synthetic.noise import disturb_masks, disturb_poses
-    from datamodules.synthetic.shape import watering_can
-    from visdom_plugin.geometry.cameras import Cameras
-    from visdom_plugin.scene import Scene, Views
-
     config = config or SyntheticConfig()
     config.check()
     shape = watering_can()
@@ -139,7 +75,7 @@ def make_scene(config: SyntheticConfig | None = None) -> Scene:
     pictures = _draw(config, cameras, shape)
     n = config.train_views
 
-    def views(part: slice, prefix: str, poses: Cameras, masks) -> Views:
+    def views(part: slice, prefix: str, poses: Cameras, masks: Sequence[Tensor]) -> Views:
         names = tuple(f"{prefix}_{i:03d}" for i in range(len(poses)))
         return Views(poses, tuple(p[0] for p in pictures[part]), tuple(masks), names)
 
@@ -154,16 +90,14 @@ def make_scene(config: SyntheticConfig | None = None) -> Scene:
         "config": asdict(config),
         "train": list(train.names),
         "test": list(test.names),
-        "hashes": hash_views(train),
+        "hashes": hash_parts(train),
     }
     vertices = torch.from_numpy(to_world(shape.vertices))
     return Scene("built-in", train, test, "unknown", source, mesh=(vertices, torch.from_numpy(shape.faces)))
 
 
-def to_world(points):
+def to_world(points: ArrayLike) -> np.ndarray:
     """Points (..., 3) of the shape's frame in the world frame: turned, scaled and moved off the origin."""
-    import numpy as np
-
     c, s = math.cos(_YAW), math.sin(_YAW)
     local = np.asarray(points) - np.array(_MIDDLE)
     x, y, z = local[..., 0], local[..., 1], local[..., 2]
@@ -171,22 +105,17 @@ def to_world(points):
     return _SCALE * turned + np.array(_CENTRE)
 
 
-def _rows(config: SyntheticConfig) -> list[tuple]:
+def _rows(config: SyntheticConfig) -> list[tuple[float, ...]]:
     # Test cameras wind round the object; the golden angle keeps any number of them evenly spread.
     golden = 180 * (3 - math.sqrt(5))
-    test = []
+    test: list[tuple[float, ...]] = []
     for i in range(config.test_views):
         height = (i + 0.5) / config.test_views
         test.append((33 + golden * i, 8 + 52 * height, 3.9 + 0.5 * math.cos(2.4 * i), 35, 0, 0, 0, 0))
     return [*_TRAIN[: config.train_views], *test]
 
 
-def _camera(config: SyntheticConfig, row: tuple):
-    import torch
-
-    from visdom_plugin.geometry.camera_paths import look_at_camera
-    from visdom_plugin.geometry.cameras import Cameras
-
+def _camera(config: SyntheticConfig, row: tuple[float, ...]) -> Cameras:
     azimuth, elevation, distance, view, right, up, shift_x, shift_y = row
     azimuth, elevation = math.radians(azimuth), math.radians(elevation)
     direction = torch.tensor(
@@ -214,11 +143,7 @@ def _camera(config: SyntheticConfig, row: tuple):
     )
 
 
-def _truncate(config: SyntheticConfig, cameras, shape):
-    import torch
-
-    from visdom_plugin.geometry.cameras import Cameras, project
-
+def _truncate(config: SyntheticConfig, cameras: Cameras, shape: Shape) -> Cameras:
     uv, _ = project(cameras, torch.from_numpy(to_world(shape.vertices)))
     left, right = uv[..., 0].amin(-1), uv[..., 0].amax(-1)
     # Even views lose their right-hand side, and so on in turn; the object slides out over the frame's edge.
@@ -231,21 +156,13 @@ def _truncate(config: SyntheticConfig, cameras, shape):
     return Cameras(K, cameras.world_from_camera, cameras.width, cameras.height)
 
 
-def _draw(config: SyntheticConfig, cameras, shape) -> list[tuple]:
-    """(image, mask) of every camera, as tensors."""
-    from concurrent.futures import ThreadPoolExecutor
-
+def _draw(config: SyntheticConfig, cameras: Cameras, shape: Shape) -> list[tuple[Tensor, Tensor]]:
+    """(image, mask) of every camera."""
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(lambda i: _photograph(config, cameras[i], shape), range(len(cameras))))
 
 
-def _photograph(config: SyntheticConfig, camera, shape) -> tuple:
-    import numpy as np
-    import torch
-
-    from datamodules.synthetic.paint import paint_object, paint_room
-    from datamodules.synthetic.render import rasterise
-
+def _photograph(config: SyntheticConfig, camera: Cameras, shape: Shape) -> tuple[Tensor, Tensor]:
     s, width, height = _SAMPLES, int(camera.width), int(camera.height)
     K, motion = camera.intrinsics.numpy(), camera.world_from_camera.numpy()
     away = to_world(shape.vertices) - motion[:3, 3]
@@ -256,7 +173,7 @@ def _photograph(config: SyntheticConfig, camera, shape) -> tuple:
     seen = rasterise(uv * s, local[2], shape.faces, width * s, height * s)
     weights = seen.weights.astype(np.float32)
 
-    def blend(values):
+    def blend(values: np.ndarray) -> np.ndarray:
         corners = values.astype(np.float32)[shape.faces[seen.face]]
         return (
             corners[:, 0] * weights[:, :1] + corners[:, 1] * weights[:, 1:2] + corners[:, 2] * weights[:, 2:]
@@ -267,7 +184,8 @@ def _photograph(config: SyntheticConfig, camera, shape) -> tuple:
     samples[seen.sample, :3], samples[seen.sample, 3] = colours, 1
     samples = samples.reshape(height, s, width, s, 4)
     mask = samples[:, s // 2, :, s // 2, 3] > 0
-    mean = sum(samples[:, i, :, j] for i in range(s) for j in range(s)) / np.float32(s * s)
+    parts = (samples[:, i, :, j] for i in range(s) for j in range(s))
+    mean = functools.reduce(np.add, parts) / np.float32(s * s)
     if config.background == "room":
         behind = paint_room(*_rays_in_shape(camera)).reshape(height, width, 3)
     else:
@@ -277,16 +195,15 @@ def _photograph(config: SyntheticConfig, camera, shape) -> tuple:
     return torch.from_numpy(image), torch.from_numpy(mask.copy())
 
 
-def _rays_in_shape(camera):
+def _rays_in_shape(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and directions (H W, 3) float32 of the pixel centres in the shape's frame."""
-    import numpy as np
 
     K, motion = camera.intrinsics.numpy(), camera.world_from_camera.numpy()
     v, u = np.mgrid[: int(camera.height), : int(camera.width)] + 0.5
     x, y = (u.ravel() - K[0, 2]) / K[0, 0], (v.ravel() - K[1, 2]) / K[1, 1]
-    d = [motion[k, 0] * x + motion[k, 1] * y + motion[k, 2] for k in range(3)]
+    local = [motion[k, 0] * x + motion[k, 1] * y + motion[k, 2] for k in range(3)]
     c, s = math.cos(_YAW), math.sin(_YAW)
-    d = np.stack([c * d[0] + s * d[1], c * d[1] - s * d[0], d[2]], -1)
+    d = np.stack([c * local[0] + s * local[1], c * local[1] - s * local[0], local[2]], -1)
     d /= np.sqrt(d[:, :1] ** 2 + d[:, 1:2] ** 2 + d[:, 2:] ** 2)
     o = (motion[:3, 3] - np.array(_CENTRE)) / _SCALE
     return np.array([c * o[0] + s * o[1], c * o[1] - s * o[0], o[2]]) + np.array(_MIDDLE), d.astype(

@@ -8,10 +8,12 @@ overlaps: the mesh is the boundary of the solid.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 PARTS = ("body", "inside", "foot", "spout", "handle", "bail")
 
@@ -74,7 +76,7 @@ def watering_can() -> Shape:
     return body.finish()
 
 
-def _plane(points, azimuth: float, mirror: bool = False) -> np.ndarray:
+def _plane(points: ArrayLike, azimuth: float, mirror: bool = False) -> np.ndarray:
     flat = np.asarray(points, np.float64)
     along = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     return flat[:, :1] * along + flat[:, 1:] * np.array([0.0, 0.0, 1.0])
@@ -99,7 +101,7 @@ def _smooth(points: np.ndarray, count: int) -> np.ndarray:
 class _Body:
     """The turned body as a grid of quads, from which blocks are taken out for the tubes."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         profile = _smooth(np.array(_PROFILE), _RINGS + 2)
         self.rings = profile[1:-1]
         angle = np.arange(_AROUND) * (2 * np.pi / _AROUND)
@@ -113,7 +115,17 @@ class _Body:
         self.parts: list[np.ndarray] = []
         self.rim = int(self.rings[:, 1].argmax())
 
-    def sew_tube(self, path, radii, *, start, block, steps, part, end=None) -> None:
+    def sew_tube(
+        self,
+        path: np.ndarray,
+        radii: Sequence[float],
+        *,
+        start: tuple[float, float],
+        block: int,
+        steps: int,
+        part: str,
+        end: tuple[float, float] | None = None,
+    ) -> None:
         """A tube of round cross-section along `path`, from the wall at `start` (azimuth, height) to the wall
         at `end`, or to a dished cap."""
         curve = _smooth(np.concatenate([path, np.asarray(radii)[:, None]], -1), steps)
@@ -164,7 +176,7 @@ class _Body:
         vertices, faces = vertices[used], faces.reshape(-1, 3).astype(np.int64)
         return Shape(vertices, faces, np.concatenate(self.parts), vertex_normals(vertices, faces))
 
-    def _open(self, where, block: int) -> np.ndarray:
+    def _open(self, where: tuple[float, float], block: int) -> np.ndarray:
         """Takes out block x block quads round (azimuth, height) on the outside; the hole's edge, (4 block,)
         vertex indices, anticlockwise from outside."""
         azimuth, height = where
@@ -177,7 +189,7 @@ class _Body:
         sides = np.arange(row + 1, row + block) * _AROUND
         return np.concatenate([low, sides + columns[-1], high[::-1], (sides + columns[0])[::-1]])
 
-    def _angles(self, loop, normal, across) -> np.ndarray:
+    def _angles(self, loop: np.ndarray, normal: np.ndarray, across: np.ndarray) -> np.ndarray:
         corners = np.concatenate(self.vertices)[loop]
         away = corners - corners.mean(0)
         return np.arctan2(away @ across, away @ normal)
@@ -187,7 +199,7 @@ class _Body:
         first, self.count = self.count, self.count + points.size // 3
         return np.arange(first, self.count).reshape(points.shape[:-1])
 
-    def _strip(self, one, two, part) -> None:
+    def _strip(self, one: np.ndarray, two: np.ndarray, part: str) -> None:
         a, b, c, d = one, np.roll(one, -1), np.roll(two, -1), two
         self._emit(np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]), part)
 

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from datamodules.views.reader import InspectedView, LoadedView
+from datamodules.capture import InspectedView, LoadedView
 
 
 class LaterViews:
@@ -27,16 +27,17 @@ class LaterViews:
 
     def __getitem__(self, i: int) -> LoadedView:
         with self._locks[i]:
-            if self._loaded[i] is None:
-                self._loaded[i] = self._read(i)
-            return self._loaded[i]
+            view = self._loaded[i]
+            if view is None:
+                view = self._loaded[i] = self._read(i)
+            return view
 
     def field(self, name: str) -> Sequence[Any]:
         """One field of `LoadedView` of all views."""
         return _Field(self, name, len(self._loaded))
 
 
-class _Field(Sequence):
+class _Field(Sequence[Any]):
     def __init__(self, views: LaterViews, name: str, count: int):
         self._views, self._name, self._count = views, name, count
         self.fingerprint = views.fingerprint
@@ -44,7 +45,7 @@ class _Field(Sequence):
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: int | slice) -> Any:
         if isinstance(index, slice):
             return tuple(self[i] for i in range(*index.indices(self._count)))
         return getattr(self._views[range(self._count)[index]], self._name)

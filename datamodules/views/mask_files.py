@@ -7,17 +7,14 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from datamodules.capture import Capture
 from datamodules.files.paths import inside, printable, stem
 from datamodules.request import Request
 from visdom_plugin.errors import SceneError
-
-if TYPE_CHECKING:
-    from datamodules.open_scene import Capture
 
 log = logging.getLogger(__name__)
 

@@ -8,52 +8,22 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from datamodules.capture import Calibration, Capture, InspectedView, LoadedView, ViewFiles
 from datamodules.files import images, masks
 from datamodules.files.paths import inside, printable
 from datamodules.files.undistort import Distortion, undistort
 from datamodules.request import Request
 from visdom_plugin.errors import SceneError
 
-if TYPE_CHECKING:
-    from datamodules.open_scene import Calibration, Capture
-
-
+_T = TypeVar("_T")
 _VERSION = 1
 """Raised when other pixels are made of the same files."""
-
-
-class ViewFiles(NamedTuple):
-    """Where the pixels of one view lie below the scene's root; the fields of `capture.Frame`."""
-
-    name: str
-    image: str
-    mask: str | None
-    ignore: str | None
-    excluded: str | None
-    depth: str | None
-
-
-class LoadedView(NamedTuple):
-    """One view at its final size."""
-
-    image: Tensor
-    """(H, W, 3) uint8."""
-    mask: Tensor
-    """(H, W) bool, True on the object."""
-    ignore: Tensor | None
-    """(H, W) bool, True where nothing is known."""
-    depth: Tensor | None
-    """(H, W) float32."""
-    masked: bool
-    """False where the data has no mask for it; then `mask` is True everywhere."""
-    soft: float = 0.0
-    """Share of the mask's pixels that are neither black nor white."""
 
 
 class _Job(NamedTuple):
@@ -63,20 +33,6 @@ class _Job(NamedTuple):
     """How much smaller the photographs' files are than the cameras say."""
     downscale: float
     request: Request
-
-
-class InspectedView(NamedTuple):
-    """What is known of a view whose photograph has not been decoded."""
-
-    size: tuple[int, int]
-    """Width and height it will have."""
-    masked: bool
-    ignoring: bool
-    """Whether it may have ignored pixels."""
-    deep: bool
-    """Whether it has a depth map."""
-    fingerprint: str
-    """SHA-256 of its files and of all that decides what is made of them."""
 
 
 class ViewReader:
@@ -129,80 +85,97 @@ class ViewReader:
             ) from error
 
 
-def spread_out(function: Callable[[int], Any], positions: Sequence[int]) -> list[Any]:
+def spread_out(function: Callable[[int], _T], positions: Sequence[int]) -> list[_T]:
     """`function` of each position, on all cores; the first (in the given order) error is raised."""
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
         return list(pool.map(function, positions))
 
 
-def _open_photograph(job: _Job, file: ViewFiles, full: tuple[int, int]):
-    """Path, bytes, size and wanted size."""
+class _Photograph(NamedTuple):
+    path: Path
+    data: bytes
+    size: tuple[int, int]
+    alpha: bool
+    """Whether it promises transparency."""
+    target: tuple[int, int]
+    """Width and height that are wanted."""
+
+
+def _open_photograph(job: _Job, file: ViewFiles, full: tuple[int, int]) -> _Photograph:
     path = inside(job.root, file.image, outside=job.request.allow_outside)
     data = images.read_file(path)
-    size = images.size_of(data, path)
+    size, alpha = images.read_header(data, path)
     _check_size(size, full, job.factor, path)
-    target = size if job.factor > 1 else tuple(max(1, round(s / job.downscale)) for s in size)
-    return path, data, size, target
+    width, height = (s if job.factor > 1 else max(1, round(s / job.downscale)) for s in size)
+    return _Photograph(path, data, size, alpha, (width, height))
 
 
 def _inspect_view(job: _Job, file: ViewFiles, full: tuple[int, int], plan: str) -> InspectedView:
-    path, data, size, target = _open_photograph(job, file, full)
+    photo = _open_photograph(job, file, full)
     state = hashlib.sha256(f"{_VERSION} {plan} {job.request.mask_source}".encode())
-    state.update(data)
+    state.update(photo.data)
     outside = job.request.allow_outside
     for relative in (file.mask, file.ignore, file.excluded, file.depth):
         if relative is not None and (other := inside(job.root, relative, outside=outside)).is_file():
             state.update(hashlib.sha256(images.read_file(other)).digest())
-    masked = images.has_alpha(data) and job.request.mask_source != "folder"
+    masked = photo.alpha and job.request.mask_source != "folder"
     if file.mask is not None or (masked and job.request.allow_missing_masks):
-        soft, mask_path = _read_mask(job, file, size, data, path)
+        soft, mask_path = _read_mask(job, file, photo)
         masked = soft is not None
-        if masked:
-            masks.refuse_empty(_resize(soft, *target) > 0.5, float(soft.max()), mask_path)
+        if soft is not None:
+            masks.refuse_empty(_resize(soft, *photo.target) > 0.5, float(soft.max()), mask_path)
     if not masked and not job.request.allow_missing_masks:
-        _no_mask(job, file, path)
+        _no_mask(job, file, photo.path)
     for relative in (file.ignore, file.excluded):
         if relative is not None:
-            _read_other(job, relative, size, "mask of ignored pixels")
+            _read_other(job, relative, photo.size, "mask of ignored pixels")
     depth = None if file.depth is None else inside(job.root, file.depth, outside=outside)
-    ignoring = file.ignore is not None or file.excluded is not None
-    return InspectedView(target, masked, ignoring, depth is not None and depth.is_file(), state.hexdigest())
+    return InspectedView(
+        size=photo.target,
+        masked=masked,
+        ignoring=file.ignore is not None or file.excluded is not None,
+        deep=depth is not None and depth.is_file(),
+        fingerprint=state.hexdigest(),
+    )
 
 
 def _read_view(
     job: _Job, file: ViewFiles, full: tuple[int, int], K: np.ndarray, distortion: Distortion | None
 ) -> LoadedView:
-    path, data, size, target = _open_photograph(job, file, full)
-    soft, mask_path = _read_mask(job, file, size, data, path)
-    masked = soft is not None
-    if soft is None:
-        if not job.request.allow_missing_masks:
-            _no_mask(job, file, path)
-        soft = np.ones((1, 1), np.float32)
-    image = images.decode_photograph(data, path)
-    ignore = _read_ignored(job, file, size)
+    photo = _open_photograph(job, file, full)
+    opacity, mask_path = _read_mask(job, file, photo)
+    masked = opacity is not None
+    if not masked and not job.request.allow_missing_masks:
+        _no_mask(job, file, photo.path)
+    soft = np.ones((1, 1), np.float32) if opacity is None else opacity
+    image = images.decode_photograph(photo.data, photo.path)
+    unknown = _read_ignored(job, file, photo.size)
     if distortion is not None:
-        scaled = K * np.array([[size[0] / full[0]], [size[1] / full[1]], [1.0]])
-        soft = _resize(soft, *size)
-        image, soft, ignore = undistort(scaled, distortion, image, soft, ignore, where=path)
+        scaled = K * np.array([[photo.size[0] / full[0]], [photo.size[1] / full[1]], [1.0]])
+        flat = undistort(scaled, distortion, image, _resize(soft, *photo.size), unknown, where=photo.path)
+        image, unknown = flat.image, flat.ignore
+        soft = soft if flat.mask is None else flat.mask
+    width, height = photo.target
     if masked:
-        mask = _resize(soft, *target) > 0.5
+        mask = _resize(soft, width, height) > 0.5
         masks.refuse_empty(mask, float(soft.max()), mask_path)
     else:
-        mask = np.ones(target[::-1], bool)
+        mask = np.ones((height, width), bool)
     # Colours are stored for what is there: where nothing is, they are anything.
-    cut_out = masked and mask_path == path
-    image = images.shrink_cut_out(image, soft, *target) if cut_out else images.shrink(image, *target)
-    if ignore is not None:
+    if masked and mask_path == photo.path:
+        image = images.shrink_cut_out(image, soft, width, height)
+    else:
+        image = images.shrink(image, width, height)
+    if unknown is not None:
         # A pixel that is unknown in part is unknown.
-        ignore = torch.from_numpy(images.shrink(ignore.astype(np.float32), *target) > 0)
+        unknown = images.shrink(unknown.astype(np.float32), width, height) > 0
     return LoadedView(
-        torch.from_numpy(image),
-        torch.from_numpy(mask),
-        ignore,
-        _read_depth(job, file, full, target),
-        masked,
-        masks.soft_share(soft) if masked else 0.0,
+        image=torch.from_numpy(image),
+        mask=torch.from_numpy(mask),
+        ignore=None if unknown is None else torch.from_numpy(unknown),
+        depth=_read_depth(job, file, full, photo.target),
+        masked=masked,
+        soft=masks.soft_share(soft) if masked else 0.0,
     )
 
 
@@ -238,29 +211,26 @@ def _no_mask(job: _Job, file: ViewFiles, path: Path) -> None:
     )
 
 
-def _read_mask(
-    job: _Job, file: ViewFiles, size: tuple[int, int], photograph: bytes, path: Path
-) -> tuple[np.ndarray | None, Path]:
+def _read_mask(job: _Job, file: ViewFiles, photo: _Photograph) -> tuple[np.ndarray | None, Path]:
     """(H, W) float32 opacity at the file's own size, and the file; None where there is no mask."""
-    source, alpha, found = job.request.mask_source, None, None
-    if source != "folder" and (file.mask is None or source == "alpha" or images.has_alpha(photograph)):
-        if images.has_alpha(photograph):
-            alpha = masks.decode_alpha(images.decode_any(photograph, path))
-        if file.mask is None or source == "alpha":
-            return (None if alpha is None else alpha.opacity), path
+    source, alpha = job.request.mask_source, None
+    if photo.alpha and source != "folder":
+        alpha = masks.decode_alpha(images.decode_any(photo.data, photo.path))
+    if source == "alpha" or (file.mask is None and source != "folder"):
+        return (None if alpha is None else alpha.opacity), photo.path
     if file.mask is None:
-        return None, path
-    data, mask_path = _read_other(job, file.mask, size, "mask")
-    found = masks.decode(data, mask_path)
+        return None, photo.path
+    data, mask_path = _read_other(job, file.mask, photo.size, "mask")
+    found = masks.decode_mask(data, mask_path)
     if alpha is not None:
-        masks.refuse_two(found, alpha, mask_path, path)
+        masks.refuse_two(found, alpha, mask_path, photo.path)
     return found.opacity, mask_path
 
 
 def _read_other(job: _Job, relative: str, size: tuple[int, int], what: str) -> tuple[bytes, Path]:
     path = inside(job.root, relative, outside=job.request.allow_outside)
     data = images.read_file(path)
-    other = images.size_of(data, path)
+    other = images.read_header(data, path).size
     if not masks.fits(other, size):
         raise SceneError(
             f"the {what} is {other[0]} x {other[1]} but its image is {size[0]} x {size[1]}",
@@ -283,21 +253,21 @@ def _read_ignored(job: _Job, file: ViewFiles, size: tuple[int, int]) -> np.ndarr
     for relative, black_is_unknown in ((file.ignore, True), (file.excluded, False)):
         if relative is None:
             continue
-        values = images.decode_mask(*_read_other(job, relative, size, "mask of ignored pixels"))
+        values = masks.decode_mask(*_read_other(job, relative, size, "mask of ignored pixels")).opacity
         unknown = values <= 0.5 if black_is_unknown else values > 0
         unknown = _resize(unknown.astype(np.float32), *size) > 0
         ignore = unknown if ignore is None else ignore | unknown
     return ignore if ignore is not None and ignore.any() else None
 
 
-def _read_depth(job: _Job, file: ViewFiles, full, target) -> Tensor | None:
+def _read_depth(job: _Job, file: ViewFiles, full: tuple[int, int], target: tuple[int, int]) -> Tensor | None:
     if file.depth is None:
         return None
     path = inside(job.root, file.depth, outside=job.request.allow_outside)
     if not path.is_file():
         return None
     data = images.read_file(path)
-    size = images.size_of(data, path)
+    size = images.read_header(data, path).size
     if abs(size[0] * full[1] - size[1] * full[0]) > max(full):
         raise SceneError(
             f"the depth map is {size[0]} x {size[1]}, another shape than its image's {full[0]} x {full[1]}",

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from datamodules.capture import Pools
 from datamodules.files.paths import read_inside
 from datamodules.request import Request
 from datamodules.views.view_lists import is_integer, read_list
@@ -33,17 +34,6 @@ class Split:
     """SHA-256 of each index file read, by its name."""
     rule: str
     """How the views were chosen, for people."""
-
-
-@dataclass(frozen=True)
-class Pools:
-    """What a layout says of its own split."""
-
-    train: tuple[int, ...]
-    """Positions that training views may be taken from."""
-    test: tuple[int, ...]
-    rule: str
-    """Where this split is from."""
 
 
 def every_eighth(count: int) -> Pools:

@@ -40,7 +40,8 @@ def read_list(text: str, names: Sequence[str], where: str) -> list[int]:
         named, numbered = known.places.get(word), known.position(word)
         if numbers and word == str(numbered):
             named = None
-        if named is None and numbered is None:
+        position = numbered if named is None else named
+        if position is None:
             raise ConfigError(
                 f"{where} names {word[:60]!r}, which is no view of this scene",
                 where=place,
@@ -49,7 +50,7 @@ def read_list(text: str, names: Sequence[str], where: str) -> list[int]:
             )
         if named is not None and numbered is not None and named != numbered:
             _refuse_two(word, names[named], names[numbered], numbered, place)
-        positions.append(numbered if named is None else named)
+        positions.append(position)
     if not positions or len(set(positions)) < len(positions):
         raise ConfigError(f"{where} lists {'a view twice' if positions else 'no views'}", where=place)
     return positions
@@ -63,7 +64,8 @@ def is_integer(word: str) -> bool:
 class _Names(NamedTuple):
     places: dict[str, int]
     """Positions by name, with and without ending."""
-    count: int
+    total: int
+    """Number of views."""
 
     @classmethod
     def of(cls, names: Sequence[str]) -> _Names:
@@ -71,7 +73,7 @@ class _Names(NamedTuple):
         return cls(bare | {name: i for i, name in enumerate(names)}, len(names))
 
     def position(self, word: str) -> int | None:
-        return int(word) if is_integer(word) and 0 <= int(word) < self.count else None
+        return int(word) if is_integer(word) and 0 <= int(word) < self.total else None
 
     def holds(self, word: str) -> bool:
         return word in self.places or self.position(word) is not None

@@ -107,14 +107,14 @@ def make_readers(root: Path) -> dict[str, Reader]:
         llff.cameras_of(rows, [str(i) for i in range(len(rows))], NOWHERE)
 
     def read_picture(data: bytes):
-        width, height = images.size_of(data, NOWHERE)
+        width, height = images.read_header(data, NOWHERE).size
         picture = images.decode_photograph(data, NOWHERE)
         if picture.shape != (height, width, 3):
             raise AssertionError(f"the header says {width} x {height}, decoded are {picture.shape}")
 
     def read_mask(data: bytes):
-        images.size_of(data, NOWHERE)
-        masks.decode(data, NOWHERE)
+        images.read_header(data, NOWHERE).size
+        masks.decode_mask(data, NOWHERE)
 
     def read_table(data: bytes):
         actorshq.cameras_of(actorshq.parse_calibration(data, NOWHERE), NOWHERE)

@@ -70,7 +70,7 @@ FORMS = {
 
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form_reads_the_same(form, tmp_path):
-    mask = masks.decode(FORMS[form](), tmp_path / "mask.png")
+    mask = masks.decode_mask(FORMS[form](), tmp_path / "mask.png")
     assert np.array_equal(mask.opacity > 0.5, TRUTH)
     assert mask.opacity.dtype == np.float32 and mask.opacity.max() > 0.97
     assert form == "JPEG" or mask.soft == 0
@@ -79,7 +79,7 @@ def test_every_form_reads_the_same(form, tmp_path):
 def test_two_masks_in_one_file_are_not_chosen_between(tmp_path):
     data = _pil("LA", np.stack([GREY, GREY[:, ::-1]], -1))
     with pytest.raises(SceneError, match="two different masks"):
-        masks.decode(data, tmp_path / "mask.png")
+        masks.decode_mask(data, tmp_path / "mask.png")
 
 
 @given(st.floats(0, 1))
@@ -87,7 +87,7 @@ def test_two_masks_in_one_file_are_not_chosen_between(tmp_path):
 def test_soft_pixels_are_counted(share):
     rng = np.random.default_rng(1)
     image = np.where(rng.random((30, 30)) < share, 128, 255).astype(np.uint8)
-    assert masks.decode(_cv(image), "mask.png").soft == pytest.approx((image == 128).mean())
+    assert masks.decode_mask(_cv(image), "mask.png").soft == pytest.approx((image == 128).mean())
 
 
 def test_sizes_fit_when_they_are_one_picture(tmp_path):
@@ -100,7 +100,7 @@ def test_sizes_fit_when_they_are_one_picture(tmp_path):
 
 
 def test_a_file_and_an_alpha_channel_that_disagree_are_both_named(tmp_path):
-    one = masks.decode(FORMS["L"](), tmp_path / "cup.png")
+    one = masks.decode_mask(FORMS["L"](), tmp_path / "cup.png")
     masks.refuse_two(one, one, tmp_path / "masks/cup.png", tmp_path / "images/cup.png")
     twice = masks.Mask(np.kron(one.opacity, np.ones((2, 2), np.float32)), 0.0)
     masks.refuse_two(one, twice, tmp_path / "masks/cup.png", tmp_path / "images/cup.png")

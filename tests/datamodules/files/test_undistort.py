@@ -97,7 +97,7 @@ def test_ignored_pixels_move_along_and_lost_ones_join_them():
     ignore = np.zeros((HEIGHT, WIDTH), bool)
     ignore[20:24, 30:36] = True
     outward = Distortion("SIMPLE_RADIAL", (0.3,))
-    moved = undistort(K, outward, None, None, ignore).ignore
+    moved = undistort(K, outward, ignore.astype(np.uint8), None, ignore).ignore
     alone = undistort(K, outward, np.zeros((HEIGHT, WIDTH), np.uint8)).ignore
     assert alone[0, 0] and not alone[20:24, 30:36].any()
     assert moved[21:23, 31:35].all() and np.array_equal(moved & alone, alone)

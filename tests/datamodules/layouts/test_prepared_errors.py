@@ -119,7 +119,7 @@ FAULTS = {
         lambda f: _lens(f, "SIMPLE_RADIAL", "50 24 18 -90"),
         ["SIMPLE_RADIAL", "of the 48 x 36 frame"],
     ),
-    "a lens of NaN": (lambda f: _lens(f, "OPENCV", "50 50 24 18 0 0 nan 0"), ["impossible"]),
+    "a lens of NaN": (lambda f: _lens(f, "OPENCV", "50 50 24 18 0 0 nan 0"), ["OPENCV", "finite", "nan"]),
     "unknown lens": (lambda f: _lens(f, "FOO", "1 2"), ["unknown lens model FOO"]),
     "wrong number of parameters": (lambda f: _lens(f, "PINHOLE", "50 24 18"), ["PINHOLE needs 4", "line 1"]),
     "focal length zero": (lambda f: _lens(f, "PINHOLE", "0 50 24 18"), ["impossible", "focal lengths 0"]),
