@@ -113,7 +113,7 @@ def make_readers(root: Path) -> dict[str, Reader]:
             raise AssertionError(f"the header says {width} x {height}, decoded are {picture.shape}")
 
     def read_mask(data: bytes):
-        images.read_header(data, NOWHERE).size
+        images.read_header(data, NOWHERE)
         masks.decode_mask(data, NOWHERE)
 
     def read_table(data: bytes):
