@@ -272,6 +272,13 @@ def test_a_hull_cannot_be_changed(tmp_path):
         assert hull.voxels == voxels == np.count_nonzero(hull.occupancy) and hull == made
 
 
+def test_a_summary_is_the_hulls_own():
+    given = {"k": 3}
+    hull = Hull(np.ones((2, 2, 2), bool), np.array([[0.0] * 3, [1] * 3]), given)
+    given["k"] = 4
+    assert hull.summary == {"k": 3}
+
+
 def test_a_giver_of_bounds_keeps_them():
     box = np.array([[0.0, 0, 0], [1, 1, 1]])
     hull = Hull(np.ones((2, 2, 2), bool), box)

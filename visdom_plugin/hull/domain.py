@@ -36,6 +36,8 @@ class VisibleDomain(HullSettings):
     sees; their cube holds the visible domain (of `k`, of 3 where that is 1, or of the largest smaller one that
     leaves any) and all camera centres. The default
     ball is centred on the visible domain's box and reaches its corners, and the cube holds the ball.
+
+    The settings are the fields of `HullSettings`.
     """
 
     def carve(self, cameras: Cameras, masks: Sequence[Tensor | np.ndarray] | Tensor | np.ndarray) -> Hull:
@@ -59,15 +61,18 @@ class VisibleDomain(HullSettings):
         # Settings stand on every command line: torch, numba and OpenCV are loaded when a hull is carved.
         from visdom_plugin.hull.carving.carve import carve_silhouettes
         from visdom_plugin.hull.carving.votes import gather_silhouettes
-        from visdom_plugin.hull.checks.coverage import choose_k, look_inverted
-        from visdom_plugin.hull.checks.explain_failure import explain_empty
-        from visdom_plugin.hull.checks.misfit import find_misfit
+        from visdom_plugin.hull.checks.covisibility import advise_k
+        from visdom_plugin.hull.checks.distance_fields import draw_outlines
+        from visdom_plugin.hull.checks.explain_failure import explain_empty, find_misfit
+        from visdom_plugin.hull.checks.mask_checks import look_inverted
 
         log.info("carving the hull (the first time on a machine its kernels are compiled: 10 to 30 s)")
         silhouettes = gather_silhouettes(cameras, masks, self.dilate_px)
         settings = self
         if self.k == "auto" and self.kind != "released-go":
-            settings = replace(self, k=choose_k(cameras, silhouettes))
+            advice = advise_k(draw_outlines(cameras, silhouettes))
+            log.info("k=auto takes %s", advice.why)
+            settings = replace(self, k=advice.k)
         hull = carve_silhouettes(settings, cameras, silhouettes, device=getattr(masks[0], "device", "cpu"))
         if hull is None:
             raise explain_empty(settings, cameras, silhouettes)

@@ -82,7 +82,7 @@ def test_table_and_diagnosis(scene, capsys):
     for words in (
         "watertight",
         "v3.png",
-        "its mask alone removes",
+        "Mean mask/camera mismatch",
         "nothing wrong",
         "inside at least 3 of 4 masks",
     ):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.geometry.cameras import Cameras, look_at_point, project
 from visdom_plugin.geometry.rotations import matrix_from_quaternion
 from visdom_plugin.seeding import generator
 
@@ -257,6 +257,31 @@ def clustered(c: Capture, v: int, count: int = 3) -> Fault:
     near = (lines @ lines[v]).argsort(descending=True)[:count]
     images, masks, names = (tuple(items[i] for i in near.tolist()) for items in (c.images, c.masks, c.names))
     return Fault(Capture(c.cameras[near], images, masks, names), "clustered", ())
+
+
+def seen_alone(c: Capture, v: int, part: torch.Tensor) -> Capture:
+    """All other photographs cropped, their cameras along with them, so that one view alone shows a part.
+
+    Args:
+        part: (P, 3) points of it.
+    """
+    uv, _ = project(c.cameras, part)
+    K, size = c.cameras.intrinsics.clone(), torch.stack([c.cameras.width, c.cameras.height], -1)
+    images, masks = list(c.images), list(c.masks)
+    for i in range(len(c)):
+        if i == v:
+            continue
+        (left, top), (right, bottom) = uv[i].amin(0).int().tolist(), uv[i].amax(0).int().tolist()
+        across = [slice(max(left, 1)), slice(max(right + 1, 0), None)]
+        down = [slice(max(top, 1)), slice(max(bottom + 1, 0), None)]
+        crops = [(slice(None), columns) for columns in across] + [(rows, slice(None)) for rows in down]
+        rows, columns = max(crops, key=lambda crop: int(masks[i][crop].sum()))
+        K[i, 0, 2] -= columns.start or 0
+        K[i, 1, 2] -= rows.start or 0
+        images[i], masks[i] = images[i][rows, columns], masks[i][rows, columns]
+        size[i] = torch.tensor(masks[i].shape[::-1])
+    cameras = replace(c.cameras, intrinsics=K, width=size[:, 0], height=size[:, 1])
+    return Capture(cameras, tuple(images), tuple(masks), c.names)
 
 
 FAULTS: dict[str, Callable[[Capture, int], Fault]] = {

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from datamodules import load
+from datamodules.synthetic.scene import SyntheticConfig, make_scene
 from tests.hull.balls import box_masks, ring
-from tests.hull.checks.faults import FAULTS, Capture, capture_of, clustered, judge
+from tests.hull.checks.faults import FAULTS, Capture, capture_of, clustered, judge, seen_alone
 from visdom_plugin.geometry.cameras import Cameras, project
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.check import check
@@ -299,6 +300,30 @@ def test_the_advised_k_is_what_the_views_share():
     advice = advise_k(outlines_of(Capture(turned, (), masks, ())))
     assert advice.k < 3 and f"K = {advice.k + 1} would lose" in advice.why
     assert all((advice.covered[k] <= advice.covered[k - 1] + 1e-12).all() for k in (2, 3))
+
+
+def test_a_part_that_one_view_alone_shows_costs_less_than_a_hull_that_reaches_the_cameras(caplog):
+    whole = capture_of(make_scene(SyntheticConfig(size=96, train_views=9)).train)
+    hull = VisibleDomain(resolution=64).carve(whole.cameras, whole.masks)
+    points = hull.sample_inside(40_000, torch.Generator().manual_seed(0))
+    low, high = hull.extent[:, 1]
+    capture = seen_alone(whole, 7, points[points[:, 1] > high - 0.15 * (high - low)])
+    found = examine(capture)
+    (note,) = (f for f in found.notes if f.kind == "covisibility")
+    assert all(f.kind == "border" for f in found.findings) and note.views == (7,)
+    assert 0.03 < note.evidence < 0.07 and f"{note.evidence:.1%} of {capture.names[7]}" in note.what
+    assert (
+        found.advice.k == 3 and f"{note.evidence:.1%} of the mask of {capture.names[7]}" in found.advice.why
+    )
+    # No K is advised below 2, whatever is asked.
+    assert [examine(capture, k=k).advice.k for k in (1, 2, 3)] == [2, 2, 3]
+    caplog.set_level(logging.INFO, "visdom_plugin")
+    cut = VisibleDomain(k="auto", resolution=64).carve(capture.cameras, capture.masks)
+    assert cut.summary["k"] == 3 and "is lost" in caplog.text
+    assert cut.volume < 1.5 * hull.volume
+    # The user may still ask for it.
+    reaching = VisibleDomain(k=1, resolution=64).carve(capture.cameras, capture.masks)
+    assert reaching.summary["k"] == 1 and reaching.volume > 10 * cut.volume
 
 
 def test_auto_takes_the_advice_and_says_why(captures, caplog):

@@ -1,4 +1,4 @@
-"""visdom-check: what is wrong with a scene, before a minute is spent on training."""
+"""visdom-check: finds what is wrong with a scene, before a minute is spent on training."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _main(argv: Sequence[str]) -> int:
     loaded = time.perf_counter()
     k = None if options.k == "auto" else options.k
     found = check_views(views, masks, k=k, layout=scene.source.get("layout"))
-    report = _report(scene, views, found)
+    report = {"scene": scene.name, **describe_check(found, views.names)}
     report["seconds"] = {
         "load": round(loaded - started, 3),
         "check": round(time.perf_counter() - loaded, 3),
@@ -115,20 +115,20 @@ def check_views(
 ) -> Check:
     """`hull.check.check` of a scene's views; `layout` is that of a scene on disk."""
     from visdom_plugin.hull.checks.check import check
-    from visdom_plugin.hull.checks.pose_files import pose_faults
+    from visdom_plugin.hull.checks.pose_conventions import pose_faults
 
     images = () if brief else views.images
     return check(views.cameras, masks, images, views.names, k=k, brief=brief, poses=pose_faults(layout))
 
 
-def _report(scene: Scene, views: Views, found: Check) -> dict[str, Any]:
-    usable = [views.names[i] for i in found.usable]
-    report = {
-        "scene": scene.name,
-        "views": list(views.names),
+def describe_check(found: Check, names: Sequence[str]) -> dict[str, Any]:
+    """What a check of views with these names found, as plain numbers, strings and lists."""
+    usable = [names[i] for i in found.usable]
+    report: dict[str, Any] = {
+        "views": list(names),
         "clean": not found.findings,
-        "findings": [_plain(f, views.names) for f in found.findings],
-        "notes": [_plain(f, views.names) for f in found.notes],
+        "findings": [_plain(f, names) for f in found.findings],
+        "notes": [_plain(f, names) for f in found.notes],
     }
     if found.advice is not None:
         report["k"] = found.advice.k
@@ -205,15 +205,21 @@ def _table(report: dict[str, Any]) -> None:
             text = f"{escape(f['what'])}\n[italic]{escape(f['todo'])}[/italic]"
             table.add_row(f["kind"], f"[{colours[sure]}]{sure}[/]", escape(shown) or "all", text)
         console.print(table)
-    if "k_why" in report:
-        console.print(escape(report["k_why"]))
-    if "misfit" in report:
-        console.print(
-            f"masks and cameras miss each other by {report['misfit']:.2%} of the object's length in the mean; the "
-            f"others stop what passes beside a mask within {report['constraint']:.1%} of it"
-        )
+    for line in summarise_fit(report):
+        console.print(escape(line))
     if "out" in report:
         console.print(f"look at {escape(report['out'])}/check.png")
+
+
+def summarise_fit(report: dict[str, Any]) -> list[str]:
+    """A line on K and one on how well masks and cameras fit, as far as `describe_check` knows them."""
+    lines = [report["k_why"]] if "k_why" in report else []
+    if "misfit" in report:
+        lines.append(
+            f"Mean mask/camera mismatch: {report['misfit']:.2%} of the object's size. A ray beside a mask misses "
+            f"the other masks by {report['constraint']:.1%} in the mean: the more, the tighter the hull."
+        )
+    return lines
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""visdom-hull: carve the visible domain of a scene, measure it and write it down."""
+"""visdom-hull: carves the visible domain of a scene, measures it and writes it down."""
 
 from __future__ import annotations
 
@@ -7,17 +7,23 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from visdom_plugin.cli.commands.check import carving_views, check_views, describe_check, summarise_fit
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.settings import Box
 
+if TYPE_CHECKING:
+    from visdom_plugin.scene import Scene
+
 _DEFAULT = VisibleDomain()
+_UNCOVERED = 0.9
+"""Share of a mask below which the hull leaves it uncovered."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class Options(FolderOptions):
     json: bool = False
     """Print one JSON object instead of the table."""
     diagnose: bool = False
-    """Look for what is wrong: the view that disagrees, masks that touch the border, what each K leaves."""
+    """Ask the check what is wrong, as visdom-check does, and name masks that the hull leaves uncovered."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -113,7 +119,7 @@ class MaskRequest:
 
 def report_hull(
     domain: VisibleDomain,
-    scene,
+    scene: Scene,
     *,
     out: Path | None = None,
     diagnosing: bool = False,
@@ -124,7 +130,8 @@ def report_hull(
     Returns:
         Plain numbers and lists, ready for JSON.
     """
-    from visdom_plugin.hull.checks.coverage import border_share, diagnose, measure_coverage
+    from visdom_plugin.hull.checks.coverage import measure_coverage
+    from visdom_plugin.hull.checks.mask_checks import border_share
     from visdom_plugin.hull.grid.mesh import is_closed
     from visdom_plugin.scene import describe_masks
 
@@ -161,12 +168,7 @@ def report_hull(
         "agreement_means": summary["agreement_means"],
     }
     if diagnosing:
-        found = diagnose(domain, hull, cameras, silhouettes, names)
-        report["diagnosis"] = {
-            "findings": found.findings,
-            "removes": {n: round(v.removes, 4) for n, v in zip(names, found.views, strict=True)},
-            "voxels_per_k": found.voxels_per_k,
-        }
+        report["diagnosis"] = _diagnose(scene, report)
     if out is not None:
         hull.write_ply(out) if out.suffix == ".ply" else hull.save(out)
         report["out"] = str(out)
@@ -178,6 +180,26 @@ def report_hull(
         write_masks(hull, seen_by, files, masks.folder, poses=orbit, overwrite=masks.overwrite)
         report["masks_out"] = {"folder": str(masks.folder), "cameras": masks.cameras, "count": len(files)}
     return report
+
+
+def _diagnose(scene: Scene, report: dict[str, Any]) -> dict[str, Any]:
+    """What the check finds, and where the hull falls short of the masks."""
+    views, masks = carving_views(scene.train)
+    k = report["k"] if report["kind"] == "visdom" else None
+    found = describe_check(check_views(views, masks, k=k, layout=scene.source.get("layout")), views.names)
+    for name, share in report["coverage"].items():
+        if share < _UNCOVERED:
+            what = f"the hull covers only {share:.1%} of the mask of {name}"
+            todo = "look at this view's pose, and at the other masks; they rule the rest out, or K does"
+            found["findings"].append(_finding("uncovered", what, [name], share, todo))
+    if not report["bounds_closed"]:
+        what, todo = "the views leave the hull open; it is cut off at its box", "use a larger K, or --bounds"
+        found["findings"].append(_finding("open", what, [], 1.0, todo))
+    return found | {"clean": not found["findings"]}
+
+
+def _finding(kind: str, what: str, views: list[str], evidence: float, todo: str) -> dict[str, Any]:
+    return {"kind": kind, "what": what, "views": views, "sure": "certain", "evidence": evidence, "todo": todo}
 
 
 def _table(report: dict[str, Any]) -> str:
@@ -204,17 +226,12 @@ def _table(report: dict[str, Any]) -> str:
         for name, share in report["coverage"].items()
     ]
     if "diagnosis" in report:
-        rows += [
-            (
-                "K",
-                ", ".join(f"{k}: {n}" for k, n in report["diagnosis"]["voxels_per_k"].items())
-                + " voxels of 64^3",
-            )
+        found = report["diagnosis"]
+        rows += [("check", line) for line in summarise_fit(found)]
+        rows += [("found", f"{f['what']}; {f['todo']}") for f in found["findings"]] or [
+            ("found", "nothing wrong")
         ]
-        rows += [
-            (name, f"its mask alone removes {x:.1%}") for name, x in report["diagnosis"]["removes"].items()
-        ]
-        rows += [("found", text) for text in report["diagnosis"]["findings"] or ["nothing wrong"]]
+        rows += [("note", f"{f['what']}; {f['todo']}") for f in found["notes"]]
     if "out" in report:
         rows.append(("written", report["out"]))
     if "masks_out" in report:

@@ -1,4 +1,4 @@
-"""Everything that can be found out about a capture from its cameras and masks before anything is trained."""
+"""The check: finds what is wrong with a capture from its cameras and masks, before anything is trained."""
 
 from __future__ import annotations
 
@@ -11,13 +11,25 @@ import torch
 
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hull.carving.votes import gather_silhouettes
-from visdom_plugin.hull.checks.coverage import look_inverted
-from visdom_plugin.hull.checks.covisibility import LOST, USUAL_K, Advice, advise_k, measure_spread
+from visdom_plugin.hull.checks.covisibility import (
+    LEAST_K,
+    LOST,
+    USUAL_K,
+    Advice,
+    advise_k,
+    measure_spread,
+    ways_to_set_k,
+)
 from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines, draw_outlines
-from visdom_plugin.hull.checks.explain_failure import ways_to_set_k
-from visdom_plugin.hull.checks.fault_hypotheses import QUIET_PX, Suspicion, explain
+from visdom_plugin.hull.checks.fault_hypotheses import QUIET_PX, Suspicion, find_causes
 from visdom_plugin.hull.checks.findings import Finding, Name
-from visdom_plugin.hull.checks.mask_checks import check_border, check_content, check_sizes, find_repeated
+from visdom_plugin.hull.checks.mask_checks import (
+    check_border,
+    check_content,
+    check_sizes,
+    find_repeated,
+    look_inverted,
+)
 from visdom_plugin.hull.checks.pose_conventions import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.checks.silhouette_consistency import Coherence, measure_coherence
 
@@ -26,6 +38,8 @@ CLUSTERED_DEGREES = 60.0
 _DISAGREE_PX, _SPEAKING_PX = 0.1, 0.5
 _MIDDLE = 0.25
 """Principal points further than this from the images' centres, in image sizes, are outside their middle half."""
+_DEAR = 0.2
+"""Share of a mask that no other view shows: up to here a note, beyond it a finding."""
 _RAYS, _BRIEF_VIEWS = 1024, 16
 
 
@@ -93,7 +107,7 @@ def check(
     found += inverted
     turned = {v for f in inverted for v in f.views}
     found += check_border([m if i not in turned else ~m for i, m in enumerate(masks)], names)
-    causes, fit, left = explain(outlines, brief=brief, poses=poses)
+    causes, fit, left = find_causes(outlines, brief=brief, poses=poses)
     astray = _astray(chosen)
     if astray and _views_alone(causes, fit):
         notes, found = _split([*found, *repeated, astray])
@@ -109,7 +123,7 @@ def check(
     if left.sum() >= 2 and not any(c.kind in ("axes", "scale", "order", "swapped") for c in causes):
         kept = Name([names[i] for i in usable[left]])
         advice = advise_k(rest, kept, fit, USUAL_K if k is None else k)
-        found += _covisibility(advice, usable[left], k)
+        found += _covisibility(advice, usable[left], k, names)
         found += _clustered(rest, fit, chosen)
     notes, found = _split(found)
     found.sort(key=lambda f: ("certain", "likely", "possible").index(f.sure))
@@ -291,26 +305,31 @@ def _disagreement(fit: Coherence, views: np.ndarray, names: Name) -> Finding:
     )
 
 
-def _covisibility(advice: Advice, views: np.ndarray, asked: int | None) -> list[Finding]:
-    wanted = USUAL_K if asked is None else asked
-    if not advice.covered or advice.k >= min(wanted, len(views) if asked is None else wanted):
+def _covisibility(advice: Advice, views: np.ndarray, asked: int | None, names: Name) -> list[Finding]:
+    if not advice.covered:
         return []
-    if advice.k + 1 not in advice.covered:
-        what, lost = f"K = {wanted} is more than the {len(views)} usable views", np.ones(len(views))
-    else:
-        what = f"too little is seen in common for K = {wanted}: {advice.why}"
-        lost = advice.covered[1] - advice.covered[advice.k + 1]
-    return [
-        Finding(
-            "covisibility",
-            what,
-            tuple(int(v) for v in views[lost > LOST]),
-            "certain",
-            float(lost.max()),
-            f'use {ways_to_set_k(advice.k)} or k="auto", or views that show more of the object in common',
-            note=asked is None and advice.k > 1,
-        )
-    ]
+    wanted, found = USUAL_K if asked is None else asked, []
+    if advice.k < min(wanted, max(len(views), LEAST_K) if asked is None else wanted):
+        if advice.k + 1 not in advice.covered:
+            what, lost = f"K = {wanted} is more than the {len(views)} usable views", np.ones(len(views))
+        else:
+            what = f"too little is seen in common for K = {wanted}: {advice.why.partition(': ')[2]}"
+            lost = advice.covered[LEAST_K] - advice.covered[advice.k + 1]
+        todo = f'use {ways_to_set_k(advice.k)} or k="auto", or views that show more of the object in common'
+        found.append(_seen(what, views, lost, todo, note=asked is None))
+    alone = advice.covered[1] - advice.covered[LEAST_K]
+    if alone.max() > LOST:
+        shown = [f"{lost:.1%} of {names[v]}" for v, lost in zip(views, alone, strict=True) if lost > LOST]
+        what = f"no other view shows a part of the mask, which every K from {LEAST_K} on loses: {', '.join(shown)}"
+        todo = "add a view that shows this part, too; K = 1 would keep it, but opens the hull to the cameras"
+        found.append(_seen(what, views, alone, todo, note=float(alone.max()) <= _DEAR))
+    return found
+
+
+def _seen(what: str, views: np.ndarray, lost: np.ndarray, todo: str, note: bool) -> Finding:
+    """A finding on what the views see in common; `lost` (N,) is the share that each view's mask loses."""
+    concerned = tuple(int(v) for v in views[lost > LOST])
+    return Finding("covisibility", what, concerned, "certain", float(lost.max()), todo, note=note)
 
 
 def _clustered(outlines: Outlines, fit: Coherence, cameras: Cameras) -> list[Finding]:

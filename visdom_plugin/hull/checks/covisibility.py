@@ -1,4 +1,4 @@
-"""What the views see in common: co-visibility per K, the K it advises, and how far apart the views look from."""
+"""Co-visibility: what K views see in common, the K to take, and how far apart the views look from."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from visdom_plugin.hull.checks.silhouette_consistency import (
     measure_coherence,
 )
 
-USUAL_K = 3
+USUAL_K, LEAST_K = 3, 2
+"""K = 1 is never advised: what one view alone sees is closed by no other, and its hull reaches the cameras."""
 LOST = 0.02
-"""A K may leave this share of a mask's rays without support beyond what K = 1 leaves."""
+"""A K may leave this share of a mask's rays without support beyond what LEAST_K leaves."""
 _TOLERANCE_PX = 1.0
 _RAYS, _MOST_RAYS = 256, 4608
 
@@ -36,15 +37,18 @@ class Advice(NamedTuple):
 def advise_k(
     outlines: Outlines, names: Name | None = None, fit: Coherence | None = None, wanted: int = USUAL_K
 ) -> Advice:
-    """The largest K up to the wanted one whose hull still covers every mask, within LOST of K = 1.
+    """The largest K up to the wanted one whose hull covers every mask within LOST of what LEAST_K covers.
+
+    Foreground that one view alone shows is lost at every K from LEAST_K on, so it speaks for none of them; what is
+    lost is said.
 
     Args:
         outlines: the views, at least one.
         fit: from `measure_coherence`, when it is at hand.
     """
-    most = min(wanted, len(outlines))
-    if len(outlines) < 2:
-        return Advice(1, {1: np.ones(len(outlines))}, "there is only one view")
+    most = max(min(wanted, len(outlines)), LEAST_K)
+    if len(outlines) < LEAST_K:
+        return Advice(LEAST_K, {}, f"there is only one view, and no hull is closed with fewer than {LEAST_K}")
     rays = int(np.clip(_MOST_RAYS // len(outlines), 32, _RAYS))
     fit = measure_coherence(outlines, rays, power=False) if fit is None else fit
     if fit.ball is None:
@@ -56,24 +60,36 @@ def advise_k(
         hit = found.whole <= _TOLERANCE_PX
         shares = [hit[view == i].mean() if (view == i).any() else 1.0 for i in range(len(outlines))]
         covered[k] = np.array(shares)
-    chosen = next(k for k in range(most, 0, -1) if (covered[k] >= covered[1] - LOST).all())
+    chosen = next(k for k in range(most, 1, -1) if (covered[k] >= covered[LEAST_K] - LOST).all())
     names = Name([f"view {i}" for i in range(len(outlines))]) if names is None else names
     return Advice(chosen, covered, _say(chosen, most, covered, names))
 
 
 def _say(chosen: int, most: int, covered: dict[int, np.ndarray], names: Name) -> str:
-    if chosen == most:
-        worst = int(np.argmin(covered[chosen]))
-        return (
-            f"K = {chosen}: every mask keeps its object (least {names[worst]}, {covered[chosen][worst]:.1%} of "
-            f"its rays have a point that {chosen} views see)"
-        )
-    lost = covered[1] - covered[chosen + 1]
+    lost = covered[1] - covered[chosen]
     worst = int(np.argmax(lost))
+    cost = ""
+    if lost[worst] > LOST:
+        cost = f"{lost[worst]:.1%} of the mask of {names[worst]} is lost, which fewer than {chosen} views see"
+    if chosen < most:
+        more = covered[chosen] - covered[chosen + 1]
+        first = int(np.argmax(more))
+        said = (
+            f"K = {chosen + 1} would lose {more[first]:.1%} of the mask of {names[first]}, which fewer than "
+        )
+        return f"K = {chosen}: {said}{chosen + 1} views see" + (f"; {cost} already" if cost else "")
+    if cost:
+        return f"K = {chosen}: {cost}; K = 1 would keep it, but opens the hull to the cameras"
+    least = int(np.argmin(covered[chosen]))
     return (
-        f"K = {chosen}: K = {chosen + 1} would lose {lost[worst]:.1%} of the mask of {names[worst]}, which fewer "
-        f"than {chosen + 1} views see"
+        f"K = {chosen}: every mask keeps its object (least {names[least]}, {covered[chosen][least]:.1%} of "
+        f"its rays have a point that {chosen} views see)"
     )
+
+
+def ways_to_set_k(k: int) -> str:
+    """How K is set, wherever the hull is asked for."""
+    return f"K = {k} (visdom-hull -k {k}, visdom-train --method.hull.k {k}, VisibleDomain(k={k}))"
 
 
 class Spread(NamedTuple):

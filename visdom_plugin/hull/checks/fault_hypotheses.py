@@ -1,4 +1,4 @@
-"""Which fault explains why silhouettes and cameras do not fit: each suspicion is undone, the fit measured again.
+"""Fault hypotheses: each suspected cause of a misfit is undone, and the fit measured again.
 
 A suspicion is believed when undoing it lowers the residuals of all rays to a quarter or less, and more than any
 other does. Leaving a view out always lowers them a little, so a cause that keeps every view goes first when it
@@ -61,7 +61,7 @@ class _Trial(NamedTuple):
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
-def explain(
+def find_causes(
     outlines: Outlines, *, brief: bool = False, poses: PoseFaults = IN_MEMORY
 ) -> tuple[list[Suspicion], Coherence, np.ndarray]:
     """Looks for causes until the rest fits together.
@@ -154,11 +154,26 @@ def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool, pose
             )
     if silent or not alone_fits:
         return None, outlines, stays
-    close = alone <= max(2 * alone[culprit], alone[culprit] + _FLOOR_PX)
-    rivals = tuple(int(i) for i in np.flatnonzero(close) if i != culprit)
+    suspects = _closest({i: float(alone[i]) for i in range(count)})
+    if len(suspects) > 1:
+        # The object's place was found with the wrong view in it; found anew without each, it tells them apart.
+        rest = {i: outlines.keep(np.arange(count) != i) for i in suspects}
+        suspects = _closest({i: measure_coherence(rest[i], rays, power=False).score for i in suspects})
+    culprit, *rivals = suspects
     stays[culprit] = False
     detail = "" if rivals or brief else _explain_view(outlines, culprit, rays, fit, poses)
-    return Suspicion("view", (culprit,), detail, before, float(alone[culprit]), rivals), outlines, stays
+    return (
+        Suspicion("view", (culprit,), detail, before, float(alone[culprit]), tuple(rivals)),
+        outlines,
+        stays,
+    )
+
+
+def _closest(scores: dict[int, float]) -> list[int]:
+    """The views without which the others fit best, or about as well as best; the best first."""
+    best = min(scores.values())
+    close = [i for i in scores if scores[i] <= max(2 * best, best + _FLOOR_PX)]
+    return sorted(close, key=lambda i: scores[i])
 
 
 def _off_centre(outlines: Outlines) -> float:
@@ -256,7 +271,7 @@ def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence, pose
             continue
         after = measure_coherence(changed, rays)
         # A view that is mended narrows the hull down; one that merely falls silent does not.
-        if after.score <= enough and after.power > best:
+        if after.score <= enough and after.power > best and np.isfinite(after.whole[view]):
             best, said = after.power, detail
     return said
 

@@ -1,4 +1,4 @@
-"""What single masks show by themselves: wrong size, empty, full, cut off, speckled, or the same one twice."""
+"""Faults that masks show by themselves: wrong size, empty, full, cut off, speckled, or the same one twice."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from visdom_plugin.hull.checks.findings import Finding, Name
 CUT_SHARE = 0.2
 """An object is cut off in earnest when the frame's border crosses it along this part of its length; less, such as
 a foot or a handle's end, is noted."""
+_INVERTED_BORDER = 0.5
 _SPECKS, _SPECK_SHARE = 8, 0.02
 """So many pixels that differ from all eight neighbours, and so many per pixel of outline, are noise: thin and
 perforated objects reach a quarter of that."""
@@ -115,14 +116,27 @@ def find_repeated(arrays: Sequence[np.ndarray]) -> list[tuple[int, int]]:
     return pairs
 
 
+def border_share(mask: np.ndarray) -> float:
+    """Share of a mask's (H, W) border pixels that are foreground."""
+    return float(_ring(mask).astype(bool).mean())
+
+
+def look_inverted(mask: np.ndarray) -> bool:
+    """Whether most of the image's border is foreground, as in a mask that marks the background."""
+    return border_share(mask) > _INVERTED_BORDER
+
+
+def _ring(mask: np.ndarray) -> np.ndarray:
+    return np.concatenate([mask[0], mask[-1], mask[1:-1, 0], mask[1:-1, -1]])
+
+
 def border_contact(mask: np.ndarray) -> float:
     """Foreground pixels on the image's border, as a share of the object's longest side, at most 1."""
-    ring = np.concatenate([mask[0], mask[-1], mask[1:-1, 0], mask[1:-1, -1]])
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if len(rows) == 0:
         return 0.0
     extent = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
-    return min(float(np.count_nonzero(ring)) / float(extent), 1.0)
+    return min(float(np.count_nonzero(_ring(mask))) / float(extent), 1.0)
 
 
 def count_specks(mask: np.ndarray) -> tuple[int, float]:

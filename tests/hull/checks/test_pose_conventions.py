@@ -11,8 +11,7 @@ from tests.hull.checks.faults import capture_of
 from visdom_plugin.cli.commands.check import carving_views, check_views
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.checks.check import check
-from visdom_plugin.hull.checks.pose_conventions import PoseFaults
-from visdom_plugin.hull.checks.pose_files import pose_faults
+from visdom_plugin.hull.checks.pose_conventions import PoseFaults, pose_faults
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 IN_FILE = {
