@@ -105,7 +105,7 @@ def report_model(repeat: int) -> None:
         seconds = {
             "points3D.bin, number by number": plain,
             "cameras and images of 300 photographs": fastest(read, repeat),
-            "200,000 points": fastest(lambda: colmap_points.read_points(folder, ""), repeat),
+            "200,000 points": fastest(lambda: colmap_points.read_points(folder, "points3D.bin"), repeat),
         }
     for label, value in seconds.items():
         print(f"{label:40s} {1e3 * value:8.1f} ms  {plain / value:5.1f} x")

@@ -74,6 +74,8 @@ class Capture:
     """Folder of the photographs, of which there may be smaller copies in `<photographs>_<F>`."""
     mask_folder: str | None = None
     """Folder of masks named after the photographs; None where there is none."""
+    points_file: str | None = None
+    """COLMAP's file of triangulated points, below the root."""
     shrunk: float = 1.0
     """How much of the request's downscale the calibration has already (scale folders)."""
     units: str = "unknown"

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from datamodules.capture import Capture, LoadedView, ViewFiles
+from datamodules.files.colmap_points import read_points
 from datamodules.files.paths import check_name, inside, printable, stem
 from datamodules.hashing import hash_parts
 from datamodules.request import Request
@@ -103,7 +105,15 @@ def open_capture(capture: Capture, request: Request) -> Scene:
         "hashes": {**split.hashes, **hash_parts(train)},
     }
     notes = (f"layout {capture.layout}: {split.rule}", *capture.notes, *_note_soft(loaded))
-    return Scene(name, train, test, capture.units, source, notes=notes)
+    cloud = None
+    if capture.points_file is not None:
+        cloud = partial(_read_points, capture.root, capture.points_file, request.allow_outside)
+    return Scene(name, train, test, capture.units, source, notes=notes, read_points=cloud)
+
+
+def _read_points(root: Path, file: str, outside: bool) -> tuple[Tensor, Tensor] | None:
+    xyz, rgb = read_points(root, file, outside=outside)
+    return (torch.from_numpy(xyz), torch.from_numpy(rgb).float() / 255) if len(xyz) else None
 
 
 def _check_names(capture: Capture, request: Request) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 from torch import Tensor
@@ -94,6 +95,18 @@ class Scene:
     """What the reader has to say about how it understood the data, one line each."""
     mesh: tuple[Tensor, Tensor] | None = None
     """Exact surface where it is known: vertices (V, 3) float64 and faces (F, 3) int64, outward."""
+    read_points: Callable[[], tuple[Tensor, Tensor] | None] | None = field(default=None, compare=False)
+    """Reads the points that structure from motion found; None where the data has none. Ask `points`."""
+
+    @cached_property
+    def points(self) -> tuple[Tensor, Tensor] | None:
+        """(P, 3) float64 world positions and (P, 3) float32 colours in [0, 1] of the points that structure from
+        motion found, read when they are first asked for; None where the data has none.
+
+        Raises:
+            SceneError: their file is damaged.
+        """
+        return None if self.read_points is None else self.read_points()
 
 
 def hold_out(scene: Scene, index: int) -> Scene:

@@ -10,7 +10,7 @@ import numpy as np
 
 from datamodules.files.colmap_model import ByteReader, text_lines
 from datamodules.files.parsers import damaged
-from datamodules.files.paths import inside, read_inside
+from datamodules.files.paths import read_inside
 
 
 class Points(NamedTuple):
@@ -20,18 +20,22 @@ class Points(NamedTuple):
     """(P, 3) float64 world frame."""
     rgb: np.ndarray
     """(P, 3) uint8."""
-    error: np.ndarray
-    """(P,) float64 mean reprojection error in pixels."""
 
 
-def read_points(root: Path, folder: str, *, outside: bool = False) -> Points | None:
-    """The model's points3D, binary before text; None where there is no such file."""
-    for suffix, parse in ((".bin", parse_points_binary), (".txt", parse_points_text)):
-        name = f"{folder}/points3D{suffix}".lstrip("/")
-        path = inside(root, name, outside=outside)
-        if path.is_file():
-            return parse(read_inside(root, name, outside=outside), path)
-    return None
+def find_points(root: Path, folder: str) -> str | None:
+    """The model's file of points below `root`, binary before text; None where there is none."""
+    names = (f"{folder}/points3D{suffix}".lstrip("/") for suffix in (".bin", ".txt"))
+    return next((name for name in names if (root / name).is_file()), None)
+
+
+def read_points(root: Path, name: str, *, outside: bool = False) -> Points:
+    """The points in a file below `root`.
+
+    Raises:
+        SceneError: the file leads outside, or is truncated or damaged.
+    """
+    parse = parse_points_binary if name.endswith(".bin") else parse_points_text
+    return parse(read_inside(root, name, outside=outside), root / name)
 
 
 def parse_points_binary(data: bytes, path: Path) -> Points:
@@ -49,19 +53,17 @@ def parse_points_binary(data: bytes, path: Path) -> Points:
     file.need(at - file.at)
     file.finish()
     raw = (
-        np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(8, 43)]
+        np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(8, 35)]
         if count
-        else np.zeros((0, 35), np.uint8)
+        else np.zeros((0, 27), np.uint8)
     )
-    return _points(
-        raw[:, :24].copy().view("<f8"), raw[:, 24:27].copy(), raw[:, 27:].copy().view("<f8")[:, 0], path
-    )
+    return _points(raw[:, :24].copy().view("<f8"), raw[:, 24:].copy(), path)
 
 
-def _points(xyz: np.ndarray, rgb: np.ndarray, error: np.ndarray, path: Path) -> Points:
+def _points(xyz: np.ndarray, rgb: np.ndarray, path: Path) -> Points:
     if not np.isfinite(xyz).all():
         damaged(path, f"{path.name} holds points at NaN or infinite places")
-    return Points(xyz, rgb, error)
+    return Points(xyz, rgb)
 
 
 def parse_points_text(data: bytes, path: Path) -> Points:
@@ -80,4 +82,4 @@ def parse_points_text(data: bytes, path: Path) -> Points:
             damaged(path, f"line {number} is not `ID X Y Z R G B ERROR TRACK...`: {line.strip()[:80]!r}")
         rows.append(row)
     table = np.array(rows, np.float64).reshape(-1, 7)
-    return _points(table[:, :3], table[:, 3:6].astype(np.uint8), table[:, 6], path)
+    return _points(table[:, :3], table[:, 3:6].astype(np.uint8), path)

@@ -3,7 +3,6 @@
 <sequence>/{1x,2x,4x}/calibration.csv      name, w, h, rx, ry, rz, tx, ty, tz, fx, fy, px, py; a row per camera
                       rgbs/Cam001/Cam001_rgb000015.jpg, masks/Cam001/Cam001_mask000015.png
 <sequence>/aabbs.csv                       box of the actor in each frame, metres
-<sequence>/occupancy_grids/occupancy_grid000015.npz
 
 (rx, ry, rz) is the axis times the angle in radians of the camera-to-world rotation, (tx, ty, tz) the centre in
 metres, axes x right, y down, z forward. fx, px are fractions of the width, fy, py of the height: the principal
@@ -16,12 +15,9 @@ held out is not published. Training cameras are spread evenly over the others, o
 
 from __future__ import annotations
 
-import io
 import logging
 import math
 import re
-import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,7 +25,7 @@ import numpy as np
 import torch
 
 from datamodules.capture import Calibration, Capture, Frame, Pools
-from datamodules.files.parsers import csv_number, damaged, parse_csv, parse_npy, size
+from datamodules.files.parsers import csv_number, damaged, parse_csv, size
 from datamodules.files.paths import check_name, inside, read_inside
 from datamodules.files.pinholes import pinholes
 from datamodules.request import Request
@@ -44,7 +40,6 @@ _SCALES = (1, 2, 4)
 _COLUMNS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
 _CORNERS = tuple(f"aabb_{end}_{axis}" for end in ("min", "max") for axis in "xyz")
 _HELD_OUT, _ALL = 30, 160
-_LARGEST_GRID = 2**28
 
 
 def recognise(root: Path) -> str | None:
@@ -150,49 +145,6 @@ def parse_boxes(data: bytes, path: Path) -> dict[int, np.ndarray]:
             damaged(path, f"the box of frame {frame:g} is {box.tolist()}")
         boxes[int(frame)] = box
     return boxes
-
-
-def read_occupancy(root: Path, frame: int, request: Request | None = None) -> np.ndarray | None:
-    """(X, Y, Z) bool occupancy of a frame; None where the sequence has none.
-
-    Voxel i lies at i / (n - 1) of the box of aabbs.csv's union over the frames, padded to a cube.
-    """
-    outside = request is not None and request.allow_outside
-    name = f"occupancy_grids/occupancy_grid{frame:06d}.npz"
-    path = inside(root, name, outside=outside)
-    if not path.is_file():
-        return None
-    return parse_occupancy(read_inside(root, name, outside=outside), path)
-
-
-def parse_occupancy(data: bytes, path: Path) -> np.ndarray:
-    """(X, Y, Z) bool from the uint8 array `occupancy_grid`, which is stored z first.
-
-    Raises:
-        SceneError: no such array, or one that is larger than 2^28 voxels or than it says.
-    """
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            entry = archive.getinfo("occupancy_grid.npy")
-            if entry.file_size > _LARGEST_GRID or entry.file_size > 1032 * len(data):
-                damaged(path, f"the grid claims {entry.file_size} bytes", cause="a damaged or malicious file")
-            with archive.open(entry) as file:
-                raw = file.read(entry.file_size + 1)
-    except (
-        zipfile.BadZipFile,
-        KeyError,
-        OSError,
-        EOFError,
-        ValueError,
-        NotImplementedError,
-        RuntimeError,
-        zlib.error,
-    ) as error:
-        damaged(path, f"{path.name} holds no readable occupancy_grid: {str(error)[:120]}")
-    grid = parse_npy(raw, path)
-    if grid.ndim != 3 or grid.dtype != np.uint8:
-        damaged(path, f"the grid has shape {grid.shape} and type {grid.dtype}, not three dimensions of uint8")
-    return grid.transpose(2, 1, 0) > 127
 
 
 def cameras_of(rows: Sequence[dict], path: Path) -> Cameras:

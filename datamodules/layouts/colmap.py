@@ -16,6 +16,7 @@ from pathlib import Path
 
 from datamodules.capture import Calibration, Capture, Frame, sort_frames
 from datamodules.files import colmap_model
+from datamodules.files.colmap_points import find_points
 from datamodules.files.paths import check_name, stem
 from datamodules.request import Request
 from datamodules.views import splits
@@ -67,6 +68,7 @@ def read_capture(
             todo="put cameras.bin and images.bin (or the .txt pair) into sparse/0",
         )
     model = colmap_model.read_model(root, folder, outside=request.allow_outside)
+    points = find_points(root, folder)
     for image in model.images:
         check_name(image.name, model.folder, outside=request.allow_outside)
     registered = {image.name: image for image in model.images}
@@ -95,9 +97,10 @@ def read_capture(
         frames,
         calibrate,
         splits.every_eighth(len(frames)),
-        model.files,
+        (*model.files, points) if points else model.files,
         indexed=indexed,
         photographs="images",
         mask_folder=mask_folder,
+        points_file=points,
         notes=tuple(notes),
     )

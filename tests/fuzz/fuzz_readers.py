@@ -71,7 +71,7 @@ def make_readers(root: Path) -> dict[str, Reader]:
     cameras_txt, images_txt = of("txt/sparse/0/cameras.txt", "txt/sparse/0/images.txt")
     jsons = of("studio/transforms.json", "ngp/transforms.json")
     poses, table = of("poses.npy", "actor/1x/calibration.csv")
-    boxes, grid = of("actor/aabbs.csv", "actor/occupancy_grids/occupancy_grid000015.npz")
+    (boxes,) = of("actor/aabbs.csv")
     picture = views.images[0].numpy()[..., ::-1]
     alpha = np.concatenate([picture, views.masks[0].numpy()[..., None].astype(np.uint8) * 255], -1)
     pngs = [_encode(".png", a) for a in (picture, alpha, picture.astype(np.uint16) * 257, alpha[..., 3])]
@@ -135,7 +135,6 @@ def make_readers(root: Path) -> dict[str, Reader]:
         "poses_bounds.npy": Reader([poses], read_poses),
         "calibration.csv": Reader([table], read_table),
         "aabbs.csv": Reader([boxes], lambda d: actorshq.parse_boxes(d, NOWHERE)),
-        "occupancy_grid.npz": Reader([grid], lambda d: actorshq.parse_occupancy(d, NOWHERE), bytes_each=4200),
         "sparse_N.txt": Reader([b"0\n3\n2\n", b"1 2"], lambda d: splits.parse_positions(d, 4, NOWHERE)),
         "photograph, PNG": Reader(pngs, read_picture, damage_png, bytes_each=25000),
         "photograph, JPEG": Reader(jpegs, read_picture, bytes_each=5000),

@@ -73,7 +73,7 @@ def readers(tmp_path_factory):
 
 READERS = (
     "cameras.bin", "images.bin", "points3D.bin", "cameras.txt", "images.txt", "points3D.txt", "transforms.json",
-    "poses_bounds.npy", "calibration.csv", "aabbs.csv", "occupancy_grid.npz", "sparse_N.txt", "photograph, PNG",
+    "poses_bounds.npy", "calibration.csv", "aabbs.csv", "sparse_N.txt", "photograph, PNG",
     "photograph, JPEG", "mask, PNG",
 )  # fmt: skip
 

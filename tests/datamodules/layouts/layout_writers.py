@@ -6,7 +6,6 @@ Units, axes and orders are the format's own: what a reader must undo is done her
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from pathlib import Path
@@ -236,16 +235,4 @@ def write_actorshq(views: Views, folder: Path, *, frame: int = 15, scales=(1,)) 
     (folder / "aabbs.csv").write_text(
         f"frame_number,{corners}\n{frame},-1,-2,-3,1,2,3\n{frame + 1},0,0,0,1,1,1\n"
     )
-    write_occupancy(folder / f"occupancy_grids/occupancy_grid{frame:06d}.npz")
     return folder
-
-
-def write_occupancy(path: Path) -> np.ndarray:
-    """A grid of 3 x 4 x 5 (x, y, z) with one occupied voxel, stored z first."""
-    grid = np.zeros((5, 4, 3), np.uint8)
-    grid[4, 2, 1] = 255
-    path.parent.mkdir(parents=True, exist_ok=True)
-    stream = io.BytesIO()
-    np.savez_compressed(stream, occupancy_grid=grid)
-    path.write_bytes(stream.getvalue())
-    return grid

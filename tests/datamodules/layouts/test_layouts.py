@@ -273,13 +273,6 @@ def test_actorshq_cameras_without_a_photograph_are_left_out(free, tmp_path, capl
     assert "1 of 9 cameras have no photograph" in caplog.text
 
 
-def test_actorshq_occupancy_comes_x_first(tmp_path):
-    w.write_occupancy(tmp_path / "occupancy_grids/occupancy_grid000015.npz")
-    grid = actorshq.read_occupancy(tmp_path, 15)
-    assert grid.shape == (3, 4, 5) and grid.nonzero()[0].tolist() == [1] and grid[1, 2, 4]
-    assert actorshq.read_occupancy(tmp_path, 16) is None
-
-
 def test_mask_path_is_pixels_to_ignore_unless_said_otherwise(free, tmp_path):
     folder = w.write_nerfstudio(free, tmp_path / "s", alpha=True)
     path = folder / "transforms.json"
