@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 
 RADIUS = 5
@@ -16,7 +16,6 @@ TAPS = 2 * RADIUS + 1
 SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2
 ROWS_PER_PIECE = 16
-FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
 def ssim(x: Tensor, y: Tensor) -> Tensor:
@@ -95,7 +94,7 @@ class _Ssim(torch.autograd.Function):
         return torch.from_numpy(out).reshape(x.shape), None, None
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _blur_across(padded, channels, window, out):
     """Blurs one row (W C,) given with RADIUS pixels of zeros on both sides."""
     for j in range(len(out)):
@@ -106,7 +105,7 @@ def _blur_across(padded, channels, window, out):
             out[j] += weight * source[j]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _add_products(x, y, weight, mx, my, xx, yy, xy):
     for j in range(len(x)):
         a, b = x[j], y[j]
@@ -118,7 +117,7 @@ def _add_products(x, y, weight, mx, my, xx, yy, xy):
         xy[j] += wa * b
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _compare(maps):
     """Sum of the similarity over one row; turns the first three rows of `maps` into its derivatives."""
     real = maps.dtype.type
@@ -139,7 +138,7 @@ def _compare(maps):
     return total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _similarity(begin, end, x, y, channels, window, sums, slopes):
     """Rows begin .. end - 1 of all images (B, H, W C): sums (rows,), and slopes (3, B, H, W C) unless empty."""
     _, height, size = x.shape
@@ -163,7 +162,7 @@ def _similarity(begin, end, x, y, channels, window, sums, slopes):
                 slopes[k, image, v] = maps[k]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _gradient(begin, end, x, y, channels, window, slopes, scale, out):
     """Rows begin .. end - 1 of the gradient by x: the window is its own transpose, so slopes are blurred again."""
     _, height, size = x.shape

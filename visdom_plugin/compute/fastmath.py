@@ -1,8 +1,4 @@
-"""exp that LLVM can vectorise, for the kernels' own use.
-
-After a change to this file, to ../harmonics.py or to TILE, delete splat/__pycache__: numba's cache looks
-only at the file a kernel stands in, and would go on using the old code from another one.
-"""
+"""exp that LLVM can vectorise, for the kernels' own use."""
 
 from __future__ import annotations
 
@@ -11,15 +7,9 @@ import math
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, overload
+from numba.extending import intrinsic
 
-# Sums may be regrouped into vector lanes (the compiled order is fixed, so results repeat to the bit), but NaN
-# and infinity keep their meaning.
-#
-# A function with these flags is always inlined (`forceinline`). Otherwise the process that compiles it calls the
-# copy compiled by itself, and every later process, which loads the caller from numba's cache, the copy optimised
-# once more inside the caller: the last bits would differ between a machine's first run and all others.
-FAST = {"reassoc", "contract", "nsz", "arcp"}
+from visdom_plugin.compute.kernels import fast_overload
 
 
 @intrinsic
@@ -35,7 +25,7 @@ def exp_negative(x):
     raise NotImplementedError("compiled code only")
 
 
-@overload(exp_negative, jit_options={"fastmath": FAST, "error_model": "numpy", "forceinline": True})
+@fast_overload(exp_negative)
 def _exp_negative(x):
     if x != types.float32:
         return lambda x: math.exp(-x)

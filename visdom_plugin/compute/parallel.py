@@ -1,9 +1,9 @@
 """Numba kernels over both cores without a threading layer of numba's.
 
-A kernel here is an njit function with `nogil=True` whose first two arguments are a half-open range of items.
-Plain Python threads hand out ranges. This costs about 0.1 ms per launch, and in return several threads of a
-program may launch at once, a fork is harmless, nothing spins between launches (numba's OpenMP pool next to
-torch's would), and kernels compile in a fraction of the time `parallel=True` takes.
+A kernel's first two arguments are a half-open range of items; plain Python threads hand out ranges. This costs
+about 0.1 ms per launch, and in return several threads of a program may launch at once, a fork is harmless, nothing
+spins between launches (numba's OpenMP pool next to torch's would), and kernels compile in a fraction of the time
+that `parallel=True` takes.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from visdom_plugin.compute.kernels import kernel
 
 # Normalisation of the real harmonics: constant, degree 1, (xy, yz, xz), 3z^2 - 1, x^2 - y^2, and so on.
 C0 = 0.5 * math.sqrt(1 / math.pi)
@@ -23,7 +23,7 @@ C3_0 = 0.25 * math.sqrt(7 / math.pi)
 C3_2C = 0.25 * math.sqrt(105 / math.pi)
 
 
-@njit(inline="never", cache=True, error_model="numpy")
+@kernel(inline="never", error_model="numpy")
 def basis(degree, x, y, z, out):
     """Writes the (degree + 1)^2 basis functions at the unit direction (x, y, z) into out (16,)."""
     out[0] = C0
@@ -46,7 +46,7 @@ def basis(degree, x, y, z, out):
     out[15] = -C3_3 * x * (xx - 3 * yy)
 
 
-@njit(inline="never", cache=True, error_model="numpy")
+@kernel(inline="never", error_model="numpy")
 def basis_gradient(degree, x, y, z, d):
     """Writes the derivatives of the basis by x, y, z, each taken as free, into d (16, 3).
 

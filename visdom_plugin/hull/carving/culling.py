@@ -12,8 +12,8 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes, axis_terms
@@ -103,7 +103,7 @@ def _shell(pieces: Pieces, occupancy: np.ndarray, stretch: np.ndarray) -> tuple[
     return runs, starts[np.searchsorted(pieces.labels[order], np.arange(len(pieces.sizes) + 1))]
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _list_shell(begin, end, whole, coarse, grid, starts, runs):
     """Counts in `starts`, or lists from there on in `runs` unless that is empty."""
     nx, ny, _ = grid.shape
@@ -148,7 +148,7 @@ def _lay_out(silhouettes: Silhouettes, areas, edge_px: np.ndarray, about: np.nda
     return _Canvas(factors, inner + 2, offsets, foreground)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _trace(
     begin, end, runs, bounds, stretch, x, y, z, edge_px, factors, sizes, offsets, foreground, starts, pixels
 ):

@@ -10,8 +10,8 @@ the rounding error of the projection, so the result equals the dense vote bit fo
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes, axis_terms
@@ -22,7 +22,7 @@ _TOP, _LEAF = 32, 4
 _GRAIN = 2048
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _sum_areas(begin, end, pixels, sizes, offsets, table_offsets, tables):
     for view in range(begin, end):
         width, height = sizes[view]
@@ -57,12 +57,12 @@ def rounding_bounds(terms) -> np.ndarray:
     return sum(np.abs(t).max(-1) for t in terms) * 1.5e-14
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _span(a, b):
     return 0.5 * (a + b), 0.5 * (b - a)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _judge(view, i0, i1, j0, j1, k0, k1, x, y, z, slack, sizes, starts, tables):
     """What one view says of all points with indices i0..i1, j0..j1, k0..k1 (inclusive)."""
     cx, dx = _span(x[view, 2, i0], x[view, 2, i1])
@@ -112,7 +112,7 @@ def _judge(view, i0, i1, j0, j1, k0, k1, x, y, z, slack, sizes, starts, tables):
     return _OPEN
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _decide(table, visible, occupied, unsettled):
     # A hit never harms; a miss helps K and harms agreement. So the best case is all hits, and in the worst
     # case either all unsettled views miss or none sees the voxel.
@@ -123,7 +123,7 @@ def _decide(table, visible, occupied, unsettled):
     return MIXED
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _classify(begin, end, blocks, x, y, z, slack, sizes, starts, tables, table, states):
     views = len(sizes)
     for b in range(begin, end):
@@ -161,7 +161,7 @@ def classify_cells(
     return states
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _keep_centres(begin, end, cells, x, y, z, sizes, offsets, pixels, table, kept):
     views = len(sizes)
     for b in range(begin, end):
@@ -188,7 +188,7 @@ def keep_centres(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, cells: np
     return kept
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _vote_leaf(
     i0,
     i1,
@@ -244,7 +244,7 @@ def _vote_leaf(
                 m += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _carve(begin, end, x, y, z, slack, sizes, offsets, pixels, starts, tables, table, out):
     nx, ny, nz = out.shape
     views = len(sizes)

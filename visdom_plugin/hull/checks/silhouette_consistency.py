@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 from visdom_plugin.hull.checks.distance_fields import Outlines
 
@@ -40,7 +40,7 @@ class Residuals(NamedTuple):
     be said."""
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _cut(c0, c1, low, high):
     """The part of [low, high] where c0 + c1 t >= 0."""
     if c1 > 0:
@@ -52,7 +52,7 @@ def _cut(c0, c1, low, high):
     return low, high
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _march(
     begin, end, view, uv, motions, centres, intrinsics, projections, sizes, offsets, fields,
     least, near, far, ball, radius, step, whole, without, ends, counts,

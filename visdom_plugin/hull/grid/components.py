@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 
 _ONES = np.uint64(0x0101010101010101)
@@ -32,7 +32,7 @@ class Pieces(NamedTuple):
     """(R,) piece of each run."""
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _count_runs(begin, end, grid, counts):
     _, ny, nz = grid.shape
     for x in range(begin, end):
@@ -46,7 +46,7 @@ def _count_runs(begin, end, grid, counts):
             counts[x * ny + y] = runs
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _list_runs(begin, end, grid, words, starts, begins, ends):
     _, ny, nz = grid.shape
     for x in range(begin, end):
@@ -74,7 +74,7 @@ def _list_runs(begin, end, grid, words, starts, begins, ends):
                 ends[r] = nz
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _root(parents, r):
     while parents[r] != r:
         parents[r] = parents[parents[r]]
@@ -82,7 +82,7 @@ def _root(parents, r):
     return r
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _join(nx, ny, starts, begins, ends, parents):
     for x in range(nx):
         for y in range(ny):
@@ -104,7 +104,7 @@ def _join(nx, ny, starts, begins, ends, parents):
                         b += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _number(begins, ends, parents, labels, sizes):
     count = 0
     for r in range(len(parents)):
@@ -118,7 +118,7 @@ def _number(begins, ends, parents, labels, sizes):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _erase(begin, end, grid, starts, begins, ends, labels, keep):
     ny = grid.shape[1]
     for x in range(begin, end):
@@ -151,7 +151,7 @@ def erase_pieces(occupancy: np.ndarray, pieces: Pieces, keep: np.ndarray) -> Non
     spread(_erase, len(occupancy), _GRAIN, occupancy.view(np.uint8), *inputs)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _look_up(begin, end, voxels, ny, starts, begins, ends, labels, out):
     for m in range(begin, end):
         column, z = voxels[m, 0] * ny + voxels[m, 1], voxels[m, 2]

@@ -12,8 +12,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])
@@ -96,7 +96,7 @@ _EDGE_AXES = np.array([(a ^ b).bit_length() - 1 for a, b in _EDGES])
 _EDGE_OFFSETS = _CORNERS[[a for a, _ in _EDGES]]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _case_at(grid, i, j, k):
     # Cube (i, j, k) has voxel centres i - 1 and i along x, and so on; beyond the grid all is empty.
     nx, ny, nz = grid.shape
@@ -108,7 +108,7 @@ def _case_at(grid, i, j, k):
     return case
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _next_cube(grid, i, j, k):
     """The first k' >= k at which the four columns around the cube's corner change between k' - 1 and k'."""
     nx, ny, nz = grid.shape
@@ -128,7 +128,7 @@ def _next_cube(grid, i, j, k):
     return k
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _count_slabs(begin, end, grid, counts, triangles_of, vertices_of):
     _, ny, nz = grid.shape
     for i in range(begin, end):
@@ -149,7 +149,7 @@ def _count_slabs(begin, end, grid, counts, triangles_of, vertices_of):
         triangles_of[i], vertices_of[i] = triangles, vertices
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _number_slab(grid, i, first, ids, vertices):
     """Numbers and places the vertices that slab i owns."""
     _, ny, nz = grid.shape
@@ -170,7 +170,7 @@ def _number_slab(grid, i, first, ids, vertices):
             k += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _build(
     first, last, grid, chunks, table, counts, axes, offsets, first_triangle, first_vertex, vertices, faces
 ):

@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.hull import Hull, occupied_box
@@ -55,7 +55,7 @@ class Bricks(NamedTuple):
     octant i + 2 j + 4 k it goes to smaller x if i, smaller y if j, smaller z if k; it may leave the grid."""
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _pack(begin, end, grid, bits):
     nx, ny, nz = grid.shape
     for a in range(begin, end):
@@ -67,7 +67,7 @@ def _pack(begin, end, grid, bits):
                         bits[a, y >> 2, z >> 2] |= np.uint64(1) << np.uint64(base + 16 * (z & 3))
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _look_ahead(begin, end, bits, ahead):
     """Largest empty cubes by dynamic programming: one more than the smallest of the seven bricks ahead."""
     na, nb, nc = bits.shape
@@ -96,7 +96,7 @@ def build_bricks(occupancy: np.ndarray) -> Bricks:
     return Bricks(bits, ahead)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _walk_pack(count, rays, turns, hit, active, size, bits, ahead):
     """Finds where rays first are in an occupied voxel, in a grid turned so that none goes back; units of voxels.
 
@@ -153,7 +153,7 @@ def _walk_pack(count, rays, turns, hit, active, size, bits, ahead):
         count = kept
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _set_out(rays, turns, n, begin, end, size, shape):
     """Fills in the rest of a ray from its origin and direction in the grid as it is."""
     turns[n, 3], turns[n, 4], octant = 0, 0, 0
@@ -178,7 +178,7 @@ def _set_out(rays, turns, n, begin, end, size, shape):
     rays[n, 12], rays[n, 13] = begin, end
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _clip_axis(o, d, low, high, near, far):
     if d == 0:
         return (near, far) if low <= o < high else (1.0, 0.0)
@@ -188,7 +188,7 @@ def _clip_axis(o, d, low, high, near, far):
     return t0 if t0 > near else near, t1 if t1 < far else far
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _cast(begin, end, origins, directions, lower, scale, box, shape, bits, ahead, both, first, last, hit):
     # One origin may serve all rays of a camera.
     step = 0 if len(origins) == 1 else 1

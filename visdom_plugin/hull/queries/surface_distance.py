@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.grid.mesh import is_closed
 from visdom_plugin.hull.hull import Hull
@@ -98,7 +98,7 @@ def overlap(hull: Hull, vertices: np.ndarray, faces: np.ndarray) -> dict[str, fl
     }
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _turn_columns(vertices, faces, turns):
     """Turns over, for each crossing of a column of centres with a face, the first voxel at or above it."""
     nx, ny, nz = turns.shape

@@ -15,11 +15,10 @@ import math
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
-FAST = {"reassoc", "contract", "nsz", "arcp"}
-"""As in splat/arithmetic.py; functions with these flags are always inlined, for the reason given there."""
+from visdom_plugin.compute.kernels import kernel
 
 BLOCK = 256
 """Points per block, at most; groups are not divided."""
@@ -31,7 +30,7 @@ U, W = np.uint64, np.uint32
 # hashes are cut back to 32 bits after each operation, so that twice as many fit into a vector.
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _erf(x):
     """erf of x >= 0 within 1e-6 relative, at most 1: x P(x^2) / Q(x^2), fitted for least relative error."""
     real = np.float32
@@ -51,7 +50,7 @@ def _erf(x):
     return min(x * p / q, real(1))
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _weigh(scales, first, count, resolution, strengths):
     """strengths[p] = erf(1 / (sqrt(8) scale resolution)) of points first .. first + count - 1."""
     factor = np.float32(1) / (np.float32(math.sqrt(8)) * np.float32(resolution))
@@ -59,7 +58,7 @@ def _weigh(scales, first, count, resolution, strengths):
         strengths[p] = _erf(factor / scales[U(first) + p])
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _locate(points, first, count, resolution, dense, mask, offset, strengths, rows, weights):
     """Rows and weights (8 planes) of points first .. first + count - 1. NaN counts as 0."""
     zero, one = np.float32(0), np.float32(1)
@@ -114,7 +113,7 @@ def _locate(points, first, count, resolution, dense, mask, offset, strengths, ro
             rows[p + U(7) * plane] = W(W(W(i1 ^ d) & m) + o)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _locate_level(points, first, count, resolution, dense, mask, offset, strengths, rows, weights):
     """`_locate` with `dense` a constant in each of two copies."""
     if dense:
@@ -192,7 +191,7 @@ def _distribute(typing_context, table, lanes, rows, weights, source, at, row_at,
     return types.none(table, lanes, rows, weights, source, *[types.uint64] * 4), generate
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _gather(table, lanes, features, rows, weights, samples, groups, out, at, stride):
     """out[at + g stride + f] = sum over the group's points and their corners of weight * table[row, f]."""
     wide = U(features)
@@ -205,7 +204,7 @@ def _gather(table, lanes, features, rows, weights, samples, groups, out, at, str
                 _interpolate(table, lanes, rows, weights, out, to + f, f, wide, p)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _scatter(g_table, lanes, features, rows, weights, samples, groups, g_out, at, stride):
     """The transpose of `_gather`: adds to the table's gradient, in the order of the points."""
     wide = U(features)
@@ -216,7 +215,7 @@ def _scatter(g_table, lanes, features, rows, weights, samples, groups, g_out, at
                 _distribute(g_table, lanes, rows, weights, g_out, source + f, f, wide, p)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def encode(
     begin, end, samples, points, scales, table, features,
     resolutions, dense, masks, offsets, out, mean_strengths,
@@ -259,7 +258,7 @@ def encode(
             _gather(table, (0,), features, rows, weights, samples, count, out, at, stride)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def encode_backward(
     begin, end, samples, points, scales, g_out, features,
     resolutions, dense, masks, offsets, g_table,

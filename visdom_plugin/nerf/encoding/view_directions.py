@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 from visdom_plugin.geometry.harmonics import basis
 
@@ -52,7 +52,7 @@ def encode_sinusoids(directions: Tensor, degree: int = 4) -> Tensor:
     return torch.cat([directions, torch.sin(phases), torch.cos(phases)], -1)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _harmonics(begin, end, directions, out):
     for i in range(begin, end):
         basis(3, directions[i, 0], directions[i, 1], directions[i, 2], out[i])

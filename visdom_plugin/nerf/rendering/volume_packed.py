@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 from visdom_plugin.nerf.rendering.volume import EMPTY, MAX_DENSITY
 
@@ -102,7 +102,7 @@ class _Composite(torch.autograd.Function):
         return by_density, by_rgb, None, None, None, by_background
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _forward(
     begin, end, density, rgb, starts, ends, offsets, background, colour, alpha, depth, weights, passed
 ):
@@ -126,7 +126,7 @@ def _forward(
         depth[ray] = (distance + EMPTY * far) / (total + EMPTY)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _backward(
     begin, end, rgb, starts, ends, offsets, background, alpha, depth, weights, passed,
     by_colour, by_alpha, by_depth, by_density, by_rgb, by_background,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 
 POINTS_PER_PIECE = 16384
@@ -57,7 +57,7 @@ def _contract_cpu(points: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(out).reshape(points.shape), torch.from_numpy(scaled).reshape(points.shape[:-1])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _contract(begin, end, points, std, out, scaled):
     """In blocks, each step a loop without branches that the compiler can vectorise."""
     one, two, third = np.float32(1), np.float32(2), np.int32(3)

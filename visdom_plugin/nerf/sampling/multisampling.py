@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 
 RAYS_PER_PIECE = 32
@@ -110,7 +110,7 @@ def _multisample_cpu(origins, directions, distances, radius, random, std_scale):
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _hexagons(begin, end, frame, distances, radius, random, unit, steps, std_scale, points, std):
     real = np.float32
     for ray in range(begin, end):

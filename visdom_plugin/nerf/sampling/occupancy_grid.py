@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Generator, Tensor
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 
 ROUNDING = -1e-3
@@ -144,13 +144,13 @@ def intersect_cube(origins: Tensor, directions: Tensor, half_side: float) -> tup
     return enter.amax(-1).clamp_min(0), leave.amin(-1)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _count(begin, end, origins, directions, near, far, step, shift, occupied, half_side, counts):
     for r in range(begin, end):
         counts[r] = _walk(r, origins, directions, near, far, step, shift, occupied, half_side, None, 0)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _fill(
     begin, end, origins, directions, near, far, step, shift, occupied, half_side, offsets, starts, rays
 ):
@@ -160,7 +160,7 @@ def _fill(
         rays[at : offsets[r + 1]] = r
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _walk(r, origins, directions, near, far, step, shift, occupied, half_side, starts, at):
     n = occupied.shape[0]
     scale = n / (2 * half_side)
@@ -184,7 +184,7 @@ def _walk(r, origins, directions, near, far, step, shift, occupied, half_side, s
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _touch(origins, directions, near, far, step, touched, half_side):
     n = touched.shape[0]
     scale = n / (2 * half_side)

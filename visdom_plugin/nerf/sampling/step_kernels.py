@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 
 RAYS_PER_PIECE = 128
@@ -42,7 +42,7 @@ def run(kernel, columns: int, arrays: tuple[Tensor, ...], *scalars: float) -> Te
     return torch.from_numpy(out).reshape(*lead, columns)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def sample(begin, end, edges, weights, jitter, out):
     count = out.shape[1] - 1
     last = weights.shape[1] - 1
@@ -69,7 +69,7 @@ def sample(begin, end, edges, weights, jitter, out):
         out[ray, count] = min(2 * point - out[ray, count - 1], edges[ray, last + 1])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def resample_blurred(begin, end, edges, weights, at, half_width, out):
     """Once along the edges for the points plus the half width, once for those minus it."""
     n, points = weights.shape[1], at.shape[1]
@@ -95,7 +95,7 @@ def resample_blurred(begin, end, edges, weights, at, half_width, out):
             out[ray, k] = running[k + 1] - running[k]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def dilate(begin, end, edges, weights, wide, distance, out):
     """The intervals that reach a point, widened by the distance, are neighbours: two fingers bound them."""
     n = weights.shape[1]
@@ -124,7 +124,7 @@ def dilate(begin, end, edges, weights, wide, distance, out):
             out[ray, k] *= scale
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def interlevel(begin, end, edges, weights, at, proposal, half_width, eps, out):
     """The loss's slopes by the proposal's weights (rays, P), then, in a last column, the loss."""
     n = proposal.shape[1]

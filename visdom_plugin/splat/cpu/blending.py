@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from visdom_plugin.compute.fastmath import FAST, exp_negative
+from visdom_plugin.compute.fastmath import exp_negative
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.splat.cpu.projection import ALPHA_MIN
 from visdom_plugin.splat.cpu.tiles import TILE
 
@@ -31,7 +31,7 @@ CHECK_EVERY = 16
 """Gaussians between two looks at which rows are still being drawn."""
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _draw(s, p0, p1, place, u, v, a, b, c, opacity, red, green, blue, z):
     """Blends one Gaussian into pixels p0 .. p1 - 1. A pixel that is done has its T negated."""
     real = s.dtype.type
@@ -54,7 +54,7 @@ def _draw(s, p0, p1, place, u, v, a, b, c, opacity, red, green, blue, z):
         s[p + Z] += weight * z
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _open_rows(s):
     """First and one past the last row of the tile that still has a pixel to draw."""
     first, end = TILE, 0
@@ -67,14 +67,14 @@ def _open_rows(s):
     return first, end
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _rows(v, reach, top):
     """Rows of a tile whose pixel centres lie within `reach` of v: first and one past the last."""
     first, last = math.ceil(max(v - reach - 0.5 - top, 0)), math.floor(min(v + reach - 0.5 - top, TILE - 1))
     return first, last + 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def blend(
     begin, end, starts, gaussians, columns, means2d, splats, extents, background,
     rgb, alpha, depth, transmittance, last,
@@ -125,7 +125,7 @@ def blend(
                 last[y, x] = np.int32(s[p + LAST])
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, nogil=True)
+@kernel(fast=True)
 def _differentiate(s, p0, p1, place, u, v, a, b, c, opacity, red, green, blue, z):
     """Takes one Gaussian off pixels p0 .. p1 - 1 again; returns its sums of gradients, in moments of the offset.
 
@@ -163,7 +163,7 @@ def _differentiate(s, p0, p1, place, u, v, a, b, c, opacity, red, green, blue, z
     return s0, sx, sy, sxx, sxy, syy, s_red, s_green, s_blue, s_z
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def blend_backward(
     begin, end, starts, gaussians, columns, means2d, splats, extents, background,
     alpha, depth, transmittance, last, g_rgb, g_alpha, g_depth, drawn_starts, sums,
@@ -215,7 +215,7 @@ def blend_backward(
             out[5] = -s0 / opacity
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def drawn_starts_of(last, columns, tile_count):
     """Prefix sums (tiles + 1,) of how many of each tile's Gaussians were looked at by any pixel to the end."""
     starts = np.zeros(tile_count + 1, np.int64)
@@ -229,7 +229,7 @@ def drawn_starts_of(last, columns, tile_count):
     return starts
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def gather(begin, end, offsets, slot_tiles, slot_places, starts, drawn_starts, sums, g_means2d, g_splats):
     """Adds up, for Gaussians begin .. end - 1, their intersections' gradients, always in the same order."""
     for i in range(begin, end):

@@ -15,8 +15,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.geometry.harmonics import basis, basis_gradient
 
 DILATION = 0.3  # px^2, 3DGS's low-pass filter
@@ -24,13 +24,13 @@ ALPHA_MIN = 1 / 255
 FRUSTUM_MARGIN = 0.3
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _unit_quaternion(q):
     length = max(math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]), q.dtype.type(1e-12))
     return q[0] / length, q[1] / length, q[2] / length, q[3] / length, length
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _axes(i, log_scales, quaternions, camera, m, s):
     """Writes the Gaussian's axes in camera coordinates (columns of m) and its standard deviations s."""
     w, x, y, z, _ = _unit_quaternion(quaternions[i])
@@ -47,7 +47,7 @@ def _axes(i, log_scales, quaternions, camera, m, s):
         s[axis] = math.exp(log_scales[i, axis])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _clamped(ratio, focal, centre, size):
     """The ratio x/z kept where the Jacobian is trusted, and whether it was inside."""
     real = type(ratio)
@@ -56,7 +56,7 @@ def _clamped(ratio, focal, centre, size):
     return min(high, max(low, ratio)), low <= ratio <= high
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _camera_point(mean, camera):
     x = camera[0] * mean[0] + camera[1] * mean[1] + camera[2] * mean[2] + camera[9]
     y = camera[3] * mean[0] + camera[4] * mean[1] + camera[5] * mean[2] + camera[10]
@@ -64,7 +64,7 @@ def _camera_point(mean, camera):
     return x, y, z
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def project(
     begin, end, means, log_scales, quaternions, opacity_logits, sh, degree, camera, width, height,
     means2d, splats, extents, radii,
@@ -125,7 +125,7 @@ def project(
         splats[i, 4], splats[i, 5], splats[i, 6] = max(red, zero), max(green, zero), max(blue, zero)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def project_backward(
     begin, end, means, log_scales, quaternions, sh, degree, camera, width, height, splats, extents,
     g_means2d, g_splats, g_means, g_log_scales, g_quaternions, g_opacity_logits, g_sh,
@@ -217,7 +217,7 @@ def project_backward(
             g_means[i, 2] += (gz - along * dz) / length
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _rotation_backward(quaternion, g, out):
     """Gradient of a quaternion of any length from that of its rotation matrix, g (3, 3)."""
     two = g.dtype.type(2)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 
 TILE = 16
@@ -45,7 +45,7 @@ def sort_by_depth(depths: np.ndarray) -> np.ndarray:
     return _radix_order(bits.astype(np.uint64), 3 if depths.dtype == np.float32 else 6)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _radix_order(keys, digits):
     n = len(keys)
     order, other = np.arange(n), np.empty(n, np.int64)
@@ -65,7 +65,7 @@ def _radix_order(keys, digits):
     return order
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _box(u, v, extent, columns, rows):
     """Tiles whose pixel centres the Gaussian's box may reach: first and one past the last, in x and y."""
     x0 = math.floor((u - extent[0] - 0.5) / TILE)
@@ -75,7 +75,7 @@ def _box(u, v, extent, columns, rows):
     return int(max(x0, 0)), int(min(x1, columns)), int(max(y0, 0)), int(min(y1, rows))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _meets(u, v, a, b, c, tau, column, row):
     """Whether the ellipse a x^2 + 2 b x y + c y^2 <= tau about (u, v) reaches the tile's pixel centres."""
     real = type(u)
@@ -95,7 +95,7 @@ def _meets(u, v, a, b, c, tau, column, row):
     return best <= tau
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _count(begin, end, means2d, splats, extents, columns, rows, counts):
     for i in range(begin, end):
         total = 0
@@ -110,7 +110,7 @@ def _count(begin, end, means2d, splats, extents, columns, rows, counts):
         counts[i + 1] = total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel(error_model="numpy")
 def _list(begin, end, means2d, splats, extents, columns, rows, offsets, slot_tiles):
     for i in range(begin, end):
         slot = offsets[i]
@@ -126,7 +126,7 @@ def _list(begin, end, means2d, splats, extents, columns, rows, offsets, slot_til
                     slot += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _fill(order, offsets, slot_tiles, starts, gaussians, slot_places):
     for slot in range(len(slot_tiles)):
         starts[slot_tiles[slot] + 1] += 1

@@ -1,0 +1,159 @@
+"""Compiled functions, cached on disk under everything that they were compiled from.
+
+numba's own cache looks at the file that a function stands in. It would go on running old machine code after a
+change to another file, a function or a constant of which was compiled in. Here the cache is stamped with the code
+of the function and of all that it reaches, and with the values that they read. What counts is the code that this
+process has loaded, not files, which may have changed since; so any number of processes may share a cache.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from types import CodeType, FunctionType, ModuleType
+from typing import Any, TypeVar
+
+import numpy as np
+from numba import extending, njit
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.dispatcher import Dispatcher
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+# Sums may be regrouped into vector lanes (the compiled order is fixed, so results repeat to the bit), but NaN
+# and infinity keep their meaning.
+#
+# A function with these flags is always inlined (`forceinline`). Otherwise the process that compiles it calls the
+# copy compiled by itself, and every later process, which loads the caller from numba's cache, the copy optimised
+# once more inside the caller: the last bits would differ between a machine's first run and all others.
+_FAST: dict[str, Any] = {
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
+    "error_model": "numpy",
+    "forceinline": True,
+}
+
+
+def kernel(
+    *, fast: bool = False, error_model: str = "python", inline: str = "never"
+) -> Callable[[Function], Function]:
+    """Compiles a function at its first call, to run without the GIL, and keeps the machine code on disk.
+
+    Args:
+        fast: for a function of floats that other kernels call: sums may be regrouped, division by zero gives
+            infinity, and it is always inlined.
+        error_model: "python", where division by zero raises, or "numpy".
+        inline: "always" inlines before types are known.
+    """
+    options: dict[str, Any] = {"nogil": True, "error_model": error_model, "inline": inline}
+
+    def compile_later(function: Function) -> Function:
+        dispatcher: Any = njit(**options | (_FAST if fast else {}))(function)
+        if hasattr(dispatcher, "enable_caching"):  # not where NUMBA_DISABLE_JIT is set
+            dispatcher._cache = _StampedCache(dispatcher)
+        return dispatcher
+
+    return compile_later
+
+
+def fast_overload(stub: Callable[..., Any]) -> Callable[[Function], Function]:
+    """Makes kernels that call `stub` compile the function that the decorated one returns for its types."""
+
+    options: Any = _FAST
+
+    def register(choose: Function) -> Function:
+        # What stands behind the stub, for the stamp.
+        stub.__dict__.update(__wrapped__=choose, targetoptions=_FAST)
+        return extending.overload(stub, jit_options=options)(choose)
+
+    return register
+
+
+class _StampedCache(FunctionCache):
+    def __init__(self, dispatcher: Dispatcher) -> None:
+        super().__init__(dispatcher.py_func)
+        self._dispatcher = dispatcher
+        self._stamped = False
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        # numba looks here before it compiles and saves. At decoration, names that the function reads may still be
+        # missing from its module.
+        if not self._stamped:
+            stamp = fingerprint(self._dispatcher)
+            self._cache_file = _StampedFile(self.cache_path, self._impl.filename_base, stamp)
+            self._stamped = True
+        return super().load_overload(sig, target_context)
+
+
+class _StampedFile(IndexDataCacheFile):
+    """Index and data files that both carry the stamp.
+
+    A process with other code may write to the same files; between its index and its data this one's may come.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        super().save(key, (self._source_stamp, data))
+
+    def load(self, key: Any) -> Any:
+        stamp, data = super().load(key) or (None, None)
+        return data if stamp == self._source_stamp else None
+
+
+def fingerprint(function: Callable[..., Any]) -> str:
+    """Hash of what a compiled function is made from: its code, that of the functions of its package (and of this
+    one) that it reaches, and the constants they read."""
+    digest = hashlib.sha256()
+    packages = {_package(inspect.unwrap(function)), _package(kernel)}
+    for part in _parts(function, packages, set()):
+        digest.update(part.encode() + b"\0")
+    return digest.hexdigest()
+
+
+def _package(value: object) -> str:
+    name = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
+    return (name or "").split(".")[0]
+
+
+def _parts(value: object, packages: set[str], seen: set[int]) -> Iterator[str]:
+    if isinstance(value, (bool, int, float, complex, str, bytes, np.generic)) or value is None:
+        yield f"{type(value).__name__} {value!r}"
+    elif isinstance(value, np.ndarray):
+        yield f"{value.dtype.str} {value.shape} {value.tobytes().hex()}"
+    elif isinstance(value, (tuple, list, set, frozenset)):
+        yield f"{type(value).__name__} {len(value)}"
+        for item in value if isinstance(value, (tuple, list)) else sorted(value, key=repr):
+            yield from _parts(item, packages, seen)
+    elif isinstance(value, Mapping):
+        yield from _parts(list(value.items()), packages, seen)
+    elif isinstance(value, CodeType):
+        yield f"{value.co_code.hex()} {value.co_names} {value.co_varnames} {value.co_freevars}"
+        yield from _parts(value.co_consts, packages, seen)
+    else:
+        function = inspect.unwrap(value) if callable(value) else value
+        yield f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', type(value).__name__)}"
+        if isinstance(function, FunctionType) and _package(function) in packages and id(function) not in seen:
+            seen.add(id(function))
+            yield from _parts(getattr(value, "targetoptions", {}), packages, seen)
+            yield from _parts(function.__code__, packages, seen)
+            for read in _reads(function, packages):
+                yield from _parts(read, packages, seen)
+
+
+def _reads(function: FunctionType, packages: set[str]) -> Iterator[object]:
+    """What a function reads beside its arguments: defaults, closed-over values, globals, names of own modules."""
+    yield function.__defaults__
+    yield function.__kwdefaults__
+    yield [cell.cell_contents for cell in function.__closure__ or ()]
+    names = sorted(_names(function.__code__))
+    for name in names:
+        found = function.__globals__.get(name)
+        if isinstance(found, ModuleType):
+            if _package(found) in packages:
+                yield [(n, getattr(found, n)) for n in names if hasattr(found, n)]
+        elif name in function.__globals__:
+            yield (name, found)
+
+
+def _names(code: CodeType) -> set[str]:
+    inner = (_names(constant) for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*inner)
