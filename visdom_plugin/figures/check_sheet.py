@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 
+from visdom_plugin.figures.canvas import Canvas
 from visdom_plugin.hull.carving.carve import carve_silhouettes
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.distance_fields import draw_outlines
@@ -39,7 +40,7 @@ def draw_check(views: Views, masks: Sequence, found: Check) -> np.ndarray:
     masks = [np.asarray(m) for m in masks]
     hulls, wrong = _hulls_of_others(views, masks, found), _contradicted(views, masks, found)
     columns = min(len(views), max(2, math.ceil(math.sqrt(1.5 * len(views)))))
-    named = {}
+    named: dict[int, list[str]] = {}
     for f in (*found.findings, *found.notes):
         for view in f.views:
             named.setdefault(view, []).append(f"{f.kind} ({'note' if f.note else f.sure})")
@@ -52,17 +53,17 @@ def draw_check(views: Views, masks: Sequence, found: Check) -> np.ndarray:
     wide = columns * (_CELL + 6) + 6
     said = [line for f in found.findings for line in wrap(f"{f.sure}: {f.what}", wide // 7)][:_LINES]
     top = 26 + 18 * len(said)
-    sheet = np.full((top + rows * tall, wide, 3), 24, np.uint8)
+    sheet = Canvas(top + rows * tall, wide, 24)
     for at, line in enumerate(said):
-        _write(sheet, line, 8, 18 + 18 * at, (255, 255, 255))
+        sheet.write(line, 8, 18 + 18 * at, (255, 255, 255))
     if not found.findings:
-        _write(sheet, "nothing wrong", 8, 18, (120, 255, 120))
+        sheet.write("nothing wrong", 8, 18, (120, 255, 120))
     for k, (picture, name, text) in enumerate(cells):
         y, x = top + k // columns * tall, 6 + k % columns * (_CELL + 6)
-        sheet[y : y + picture.shape[0], x : x + _CELL] = picture
-        _write(sheet, name, x + 2, y + picture.shape[0] + 14, (230, 230, 230))
-        _write(sheet, text, x + 2, y + picture.shape[0] + 30, (255, 170, 80))
-    return sheet
+        sheet.paste(picture, x, y)
+        sheet.write(name, x + 2, y + picture.shape[0] + 14, (230, 230, 230), _CELL)
+        sheet.write(text, x + 2, y + picture.shape[0] + 30, (255, 170, 80), _CELL)
+    return sheet.draw()
 
 
 def _hulls_of_others(views: Views, masks: Sequence, found: Check) -> dict[int, np.ndarray]:
@@ -145,8 +146,3 @@ def _draw_view(image: np.ndarray, mask: np.ndarray, hull, wrong) -> np.ndarray:
             lines, _ = cv2.findContours(outline.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
             cv2.drawContours(picture, lines, -1, colour, 1, cv2.LINE_AA)
     return picture
-
-
-def _write(sheet: np.ndarray, text: str, x: int, y: int, colour) -> None:
-    shown = text.encode("ascii", "replace").decode()
-    cv2.putText(sheet, shown, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)

@@ -63,6 +63,8 @@ def draw_sheet(columns: list[tuple[str, list[np.ndarray]]], rows: Sequence[str])
     """
     import cv2
 
+    from visdom_plugin.figures.canvas import Canvas
+
     margin, top, gap = _sheet_margin(rows), _SHEET_TOP, _SHEET_GAP
     cells = []
     for _, pictures in columns:
@@ -72,20 +74,15 @@ def draw_sheet(columns: list[tuple[str, list[np.ndarray]]], rows: Sequence[str])
         cells.append([cv2.resize(p, size, interpolation=way) for p in pictures])
     row_height = max(p.shape[0] for column in cells for p in column)
     width = margin + len(columns) * (SHEET_WIDTH_PX + gap)
-    sheet = np.full((top + len(rows) * (row_height + gap), width, 3), 224, np.uint8)
-
-    def write(text: str, x: int, y: int) -> None:
-        cv2.putText(sheet, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
-
+    sheet = Canvas(top + len(rows) * (row_height + gap), width, 224)
     for r, label in enumerate(rows):
-        write(label, 6, top + r * (row_height + gap) + row_height // 2)
+        sheet.write(label, 6, top + r * (row_height + gap) + row_height // 2, width=margin - 8)
     for c, (title, _) in enumerate(columns):
         x = margin + c * (SHEET_WIDTH_PX + gap)
-        write(title[-34:].encode("ascii", "replace").decode(), x + 2, 16)
+        sheet.write(title, x + 2, 16, width=SHEET_WIDTH_PX - 4)
         for r, picture in enumerate(cells[c]):
-            y = top + r * (row_height + gap)
-            sheet[y : y + picture.shape[0], x : x + SHEET_WIDTH_PX] = picture
-    return sheet
+            sheet.paste(picture, x, top + r * (row_height + gap))
+    return sheet.draw()
 
 
 def cut_sheet(

@@ -72,23 +72,20 @@ def _mean(row: list[tuple[Job, Outcome]], metric: str) -> float | None:
 
 def _bars(numbers: list[dict[str, float | None]], size: tuple[int, int]) -> list[np.ndarray]:
     """One picture per variant; a full bar is the best of its metric. Drawn at the sheet's size, to stay sharp."""
-    import cv2
-
+    from visdom_plugin.figures.canvas import Canvas
     from visdom_plugin.figures.contact_sheet import SHEET_WIDTH_PX
 
     width, height = SHEET_WIDTH_PX, max(60, round(size[0] * SHEET_WIDTH_PX / size[1]))
-    most = {m: max((n[m] for n in numbers if n[m] is not None), default=1.0) or 1.0 for m, *_ in BARS}
+    most = {m: max((v for n in numbers if (v := n[m]) is not None), default=1.0) or 1.0 for m, *_ in BARS}
     pictures = []
     for row in numbers:
-        picture = np.full((height, width, 3), _BACK, np.uint8)
+        picture = Canvas(height, width, _BACK)
         for place, (metric, name, unit, colour) in enumerate(BARS):
             value, top = row[metric], round(height * (0.12 + 0.44 * place))
             if value is not None:
                 long = max(1, round((width - 16) * max(0.0, value) / most[metric]))
-                cv2.rectangle(picture, (8, top + 24), (8 + long, top + 24 + height // 8), colour, -1)
+                picture.paste(np.full((height // 8, long, 3), colour, np.uint8), 8, top + 24)
             text = f"{name} " + ("-" if value is None else f"{value:.2f} {unit}" if unit else f"{value:.3f}")
-            cv2.putText(
-                picture, text, (8, top + 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA
-            )
-        pictures.append(picture)
+            picture.write(text, 8, top + 16)
+        pictures.append(picture.draw())
     return pictures

@@ -50,6 +50,12 @@ def heading(spec: TableSpec) -> str:
     return f"{title} ({spec.edition} edition)" if spec.edition else title
 
 
+def starts_group(spec: TableSpec, r: int) -> bool:
+    """Whether the heading of a group stands above a row."""
+    group = spec.rows[r].group
+    return bool(group) and (r == 0 or spec.rows[r - 1].group != group)
+
+
 def describe_numbers(spec: TableSpec, summary: Summary) -> list[str]:
     """How the numbers are to be read, a sentence each."""
     layout = summary.layout

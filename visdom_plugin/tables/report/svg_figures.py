@@ -1,6 +1,6 @@
 """Figures of the page as inline SVG: training curves, and the spread over seeds.
 
-Colours of middle brightness, so that they show on light and dark pages; the page's style may refine them.
+Colours of middle brightness, so that they show on light and dark pages; the page's style colours the words.
 """
 
 from __future__ import annotations
@@ -9,19 +9,21 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from visdom_plugin.figures.canvas import TIP, drawing, printable, to_svg
 from visdom_plugin.tables.measures import Measure
 
-HUES = (210, 25, 140, 330, 265, 45, 185, 0, 90, 235)
-"""Of lines, in degrees; later ones are dashed."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 _POINTS = 40
 _WIDTH, _HEIGHT = 560, 240
-_LEFT, _RIGHT, _TOP, _BOTTOM = 46, 24, 10, 30
-_DOT, _PAPER = "hsl(210,65%,50%)", "hsl(25,75%,50%)"
+_DOT, _MEAN, _PAPER, _GRID = "#2c7fc9", "#777777", "#df6d20", "#99999966"
 
 
 @dataclass(frozen=True)
@@ -77,93 +79,56 @@ def draw_curves(series: Sequence[tuple[int, str, np.ndarray]]) -> str:
     Args:
         series: colour number, label and (n, 2) curve of each line.
     """
-    values = np.concatenate([curve[:, 1] for _, _, curve in series])
-    low, high, ticks = _nice(float(values.min()), float(values.max()))
-
-    def place(share: float, value: float) -> tuple[float, float]:
-        x = _LEFT + share * (_WIDTH - _LEFT - _RIGHT)
-        return x, _HEIGHT - _BOTTOM - (value - low) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
-
-    parts = []
-    for tick in ticks:
-        x, y = place(0, tick)
-        parts.append(
-            f'<line class="grid" stroke="#bbb" x1="{x}" y1="{y:.1f}" x2="{_WIDTH - _RIGHT}" y2="{y:.1f}"/>'
-        )
-        parts.append(f'<text x="{x - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:g}</text>')
-    for share in (0, 0.5, 1):
-        x, _ = place(share, low)
-        parts.append(f'<text x="{x:.0f}" y="{_HEIGHT - 12}" text-anchor="middle">{share:.0%}</text>')
-    for colour, label, curve in series:
-        points = " ".join("{:.1f},{:.1f}".format(*place(x, y)) for x, y in curve)
-        parts.append(f'<polyline fill="none" {_pen(colour)} points="{points}">{_title(label)}</polyline>')
-    return _svg(_HEIGHT, "training PSNR over the share of the schedule", parts)
+    with drawing():
+        figure, axes = _make_axes(_HEIGHT, left=46, grid="y")
+        for number, label, curve in series:
+            colour, dash = pen(number)
+            (line,) = axes.plot(*curve.T, color=colour, linestyle=dash, linewidth=2, clip_on=False)
+            line.set_gid(TIP + printable(label))
+        axes.set_xlim(0, 1)
+        axes.set_xticks([0, 0.5, 1], ["0%", "50%", "100%"])
+        return to_svg(figure, "training PSNR over the share of the schedule")
 
 
-def draw_spread(rows: Sequence[Dots], measure: Measure) -> str:
+@lru_cache(maxsize=1024)
+def draw_spread(rows: tuple[Dots, ...], measure: Measure) -> str:
     """Each row's seeds as dots, their mean as a bar, the paper's number as a hollow diamond."""
-    values = [v for row in rows for v in (*row.seeds, *([] if row.paper is None else [row.paper]))]
-    low, high, ticks = _nice(min(values), max(values))
-    left, pitch = 150, 20
-    height = _TOP + pitch * len(rows) + _BOTTOM
-
-    def place(value: float) -> float:
-        return left + (value - low) / (high - low) * (_WIDTH - left - _RIGHT)
-
-    parts = []
-    for tick in ticks:
-        x = place(tick)
-        parts.append(
-            f'<line class="grid" stroke="#bbb" x1="{x:.1f}" y1="{_TOP}" x2="{x:.1f}" y2="{height - _BOTTOM}"/>'
-        )
-        parts.append(f'<text x="{x:.1f}" y="{height - 12}" text-anchor="middle">{tick:g}</text>')
-    for i, row in enumerate(rows):
-        y = _TOP + pitch * (i + 0.5)
-        label = row.label if len(row.label) <= 22 else row.label[:21] + "…"
-        parts.append(f'<text x="{left - 8}" y="{y + 4}" text-anchor="end">{escape(label)}</text>')
-        if row.paper is not None:
-            x = place(row.paper)
-            said = _title(f"{row.label}: paper {measure.spell(row.paper)}")
-            parts.append(
-                f'<path fill="none" stroke="{_PAPER}" d="M{x:.1f} {y - 6}l6 6l-6 6l-6 -6z">{said}</path>'
-            )
-        x = place(row.mean)
-        pen = 'class="mean" stroke="#777" stroke-width="2"'
-        parts.append(f'<line {pen} x1="{x:.1f}" y1="{y - 7}" x2="{x:.1f}" y2="{y + 7}"/>')
-        for value in row.seeds:
-            said = _title(f"{row.label}: {measure.spell(value)}")
-            parts.append(f'<circle fill="{_DOT}" cx="{place(value):.1f}" cy="{y}" r="3.5">{said}</circle>')
-    return _svg(height, f"{measure.title}: seeds, mean and the paper's number", parts)
+    with drawing():
+        figure, axes = _make_axes(20 * len(rows) + 40, left=180, grid="x")
+        mark: dict[str, Any] = {"linestyle": "none", "clip_on": False}
+        for y, row in enumerate(rows):
+            tip = f"{TIP}{printable(row.label)}: "
+            if row.paper is not None:
+                said = f"{tip}paper {measure.spell(row.paper)}"
+                axes.plot(row.paper, y, "D", mfc="none", mec=_PAPER, ms=8, gid=said, **mark)
+            axes.plot(row.mean, y, "|", color=_MEAN, ms=14, mew=2, **mark)
+            for value in row.seeds:
+                axes.plot(value, y, "o", color=_DOT, mew=0, ms=7, gid=tip + measure.spell(value), **mark)
+        labels = [printable(row.label) for row in rows]
+        axes.set_yticks(range(len(rows)), [x if len(x) <= 22 else x[:21] + "…" for x in labels])
+        axes.set_ylim(len(rows) - 0.5, -0.5)
+        return to_svg(figure, f"{measure.title}: seeds, mean and the paper's number")
 
 
-def swatch(colour: int) -> str:
-    """A short line in a colour, for a legend."""
-    line = f'<line {_pen(colour)} x1="1" y1="6" x2="25" y2="6"/>'
-    return f'<svg class="swatch" viewBox="0 0 26 12" width="26" height="12" aria-hidden="true">{line}</svg>'
+def pen(number: int) -> tuple[str, str]:
+    """Colour and dashes ("solid" or "dashed") of a line."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return to_hex(colormaps["tab10"](number % 10)), "dashed" if number // 10 % 2 else "solid"
 
 
-def _pen(number: int) -> str:
-    dashes = ' stroke-dasharray="5 3"' if number // len(HUES) % 2 else ""
-    return f'stroke="hsl({HUES[number % len(HUES)]},65%,50%)" stroke-width="2"{dashes}'
+def _make_axes(height: int, left: int, grid: str) -> tuple[Figure, Axes]:
+    """Axes without frame and ticks, so that the grid alone carries the numbers."""
+    from matplotlib.figure import Figure
 
-
-def _title(text: str) -> str:
-    return f"<title>{escape(text)}</title>"
-
-
-def _svg(height: float, label: str, parts: list[str]) -> str:
-    size = f'viewBox="0 0 {_WIDTH} {height}" font-size="11"'
-    head = f'<svg class="figure" {size} role="img" aria-label="{escape(label)}">'
-    return head + "".join(parts) + "</svg>"
-
-
-def _nice(low: float, high: float) -> tuple[float, float, list[float]]:
-    """Round limits that hold both, and the round numbers between them."""
-    span = max(high - low, 1e-3 * max(abs(low), abs(high), 1.0))
-    step = 10 ** np.floor(np.log10(span / 3))
-    step = float(step * next(f for f in (1, 2, 5, 10) if span / (step * f) <= 6))
-    first, last = np.floor(low / step), np.ceil(high / step)
-    if first == last:
-        last += 1
-    ticks = [float(round(n * step, 12)) for n in np.arange(first, last + 1)]
-    return ticks[0], ticks[-1], ticks
+    figure = Figure(figsize=(_WIDTH / 72, height / 72), facecolor="none")
+    axes = figure.add_axes(
+        (left / _WIDTH, 30 / height, (_WIDTH - left - 24) / _WIDTH, 1 - 40 / height), facecolor="none"
+    )
+    axes.spines[:].set_visible(False)
+    axes.tick_params(left=False, bottom=False)
+    axes.grid(axis=grid, color=_GRID, clip_on=False)
+    axes.set_axisbelow(True)
+    axes.ticklabel_format(useOffset=False, style="plain")
+    return figure, axes

@@ -17,6 +17,7 @@ from visdom_plugin.tables.report.labels import (
     mark_of,
     spell_cell,
     spell_paper,
+    starts_group,
 )
 from visdom_plugin.tables.report.layout import Block, Head, Layout, arrange
 from visdom_plugin.tables.report.summary import Cell, Summary
@@ -106,7 +107,7 @@ def _md_block(spec: TableSpec, summary: Summary, block: Block) -> str:
         heads += [_md(head.title), *(["paper"] if there else [])]
     lines = [_pipe(heads), _pipe(["---"] + ["---:"] * (len(heads) - 1))]
     for r, row in enumerate(spec.rows):
-        if _starts_group(spec, r):
+        if starts_group(spec, r):
             lines.append(_pipe([f"*{_md(row.group)}*"] + [""] * (len(heads) - 1)))
         words = [_md(row.label)]
         for head, there in zip(block.heads, paper, strict=True):
@@ -123,7 +124,7 @@ def _tex_block(spec: TableSpec, summary: Summary, block: Block) -> list[str]:
     lines.append(rf"\cmidrule(lr){{2-{1 + len(block.heads)}}}")
     lines += [" & ".join(["", *(_tex(h.title) for h in block.heads)]) + r" \\", r"\midrule"]
     for r, row in enumerate(spec.rows):
-        if _starts_group(spec, r):
+        if starts_group(spec, r):
             lines += [
                 *([r"\addlinespace"] if r else []),
                 _tex_line([rf"\textit{{{_tex(row.group)}}}"], block),
@@ -154,11 +155,6 @@ def _marked(cell: Cell, layout: Layout, escape: Callable[[str], str], marks: tup
     if mark:
         number = marks[mark == "second"].format(number)
     return f"{number} {escape('± ' + spread)}" if spread else number
-
-
-def _starts_group(spec: TableSpec, r: int) -> bool:
-    group = spec.rows[r].group
-    return bool(group) and (r == 0 or spec.rows[r - 1].group != group)
 
 
 def _md(text: str) -> str:
