@@ -1,14 +1,13 @@
 """Canvas: pictures at their own pixels with words between them, and figures as SVG, both by matplotlib.
 
-Neither depends on the user's matplotlibrc, nor on a display; equal input gives equal bytes with the same matplotlib.
-Words may be in any script. Letters that DejaVu Sans lacks are taken from the first of `FALLBACK_FONTS` that is
-installed and has them; where none has, an empty box stands in their place.
+Neither depends on the user's matplotlibrc nor on a display, and equal input gives equal bytes with one version of
+matplotlib. Words may be in any script: letters that DejaVu Sans lacks come from the first of `FALLBACK_FONTS` that
+is installed and has them. Where none has, a box stands in their place, one for each letter.
 """
 
 from __future__ import annotations
 
 import io
-import logging
 import re
 import warnings
 from collections.abc import Iterator
@@ -24,7 +23,8 @@ if TYPE_CHECKING:
 Colour = tuple[int, int, int]
 FALLBACK_FONTS = (
     "Noto Sans", "Noto Sans CJK JP", "Noto Sans CJK SC", "Noto Sans CJK KR", "Source Han Sans", "IPAGothic",
-    "WenQuanYi Zen Hei", "WenQuanYi Micro Hei", "Droid Sans Fallback", "Hiragino Sans", "Arial Unicode MS", "Unifont",
+    "WenQuanYi Zen Hei", "WenQuanYi Micro Hei", "Droid Sans Fallback", "Hiragino Sans", "Arial Unicode MS",
+    "Unifont",
 )  # fmt: skip
 """Families with letters outside the Latin, Greek, Cyrillic and Arabic scripts, on Linux and macOS."""
 TIP = "tip "

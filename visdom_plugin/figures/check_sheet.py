@@ -28,6 +28,12 @@ _CELL = 300
 _LABEL = 40
 _LINES = 16
 _MASK, _HULL, _WRONG, _ROOM = (255, 214, 0), (0, 200, 255), (255, 40, 40), (60, 110, 255)
+_LEGEND = (
+    ("mask", _MASK),
+    ("hull of the other views", _HULL),
+    ("ruled out by other masks", _WRONG),
+    ("room this view removes", _ROOM),
+)
 _RESOLUTION = 96
 
 
@@ -52,12 +58,16 @@ def draw_check(views: Views, masks: Sequence, found: Check) -> np.ndarray:
     rows = -(-len(cells) // columns)
     wide = columns * (_CELL + 6) + 6
     said = [line for f in found.findings for line in wrap(f"{f.sure}: {f.what}", wide // 7)][:_LINES]
-    top = 26 + 18 * len(said)
+    top = 48 + 18 * max(1, len(said))
     sheet = Canvas(top + rows * tall, wide, 24)
     for at, line in enumerate(said):
         sheet.write(line, 8, 18 + 18 * at, (255, 255, 255))
     if not found.findings:
         sheet.write("nothing wrong", 8, 18, (120, 255, 120))
+    x = 8
+    for said_of, colour in _LEGEND:
+        sheet.write(said_of, x, top - 12, colour)
+        x += 7 * len(said_of) + 16
     for k, (picture, name, text) in enumerate(cells):
         y, x = top + k // columns * tall, 6 + k % columns * (_CELL + 6)
         sheet.paste(picture, x, y)

@@ -58,7 +58,9 @@ def to_html(spec: TableSpec, summary: Summary) -> str:
         runs=describe_runs(spec, summary),
         notes=spec.notes,
         failures=list_failures(spec, summary),
-        places=[place for place in places if any(place[k] for k in ("spreads", "curves", "strips", "scenes"))],
+        places=[
+            place for place in places if any(place[k] for k in ("spreads", "curves", "strips", "scenes"))
+        ],
         unfolded=len(numbers) <= OPEN,
         error_full=ERROR_FULL,
     )
