@@ -105,7 +105,7 @@ def test_a_resumed_run_equals_the_uninterrupted_one(scene, hull):
 def test_the_sets_start_alike_and_part_when_gaussians_split(scene, hull):
     method = start(scene, hull)
     advance(method, scene, range(SMALL.densify_from))
-    first, second = (one.state_dict() for one in method.sets)
+    first, second = (one.state_dict() for one in method.strategies)
     assert same(first, second)
     advance(method, scene, range(SMALL.densify_from, 30))
     first, second = method.sets

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from visdom_plugin.methods.splats.common import draw_background, fit_view, load_
 from visdom_plugin.methods.splats.configs import CorgsConfig
 from visdom_plugin.methods.splats.initial_points import draw_box, draw_points
 from visdom_plugin.methods.splats.pseudo_views import draw_between, draw_on_ellipse, fit_ellipse
+from visdom_plugin.methods.splats.strategy import Schedule, Strategy, every
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
@@ -61,11 +63,15 @@ class CorgsLite:
             xyz, rgb = draw_points(self.hooks, hull, views, c.initial_points, draw)
         extent = scene_extent(views.cameras)
         self.sets = [GaussianSet(c, xyz, rgb, extent=extent, device=device) for _ in range(2)]
+        schedule = Schedule(every(c.opacity_reset_every, c.opacity_reset_from, c.steps + 1))
+        self.strategies = [
+            Strategy(one, schedule, partial(generator, seed, "split", i)) for i, one in enumerate(self.sets)
+        ]
         self.co_prune_distance = c.co_prune_extents * extent if c.co_prune_world is None else c.co_prune_world
 
     def train_step(self, batch: ViewBatch, step: int) -> StepOutput:
         c, done = self.config, step + 1
-        degree = min(c.sh_degree, step // c.sh_every)
+        degree = self.strategies[0].sh_degree(step)
         background = draw_background(c, generator(self.seed, "step", step), self.device)
         sets = [one.gaussians() for one in self.sets]
 
@@ -97,18 +103,12 @@ class CorgsLite:
     @torch.no_grad()
     def optimise(self, step: int, output: StepOutput) -> None:
         c, done = self.config, step + 1
-        since_reset = done - c.opacity_reset_from
-        for i, (one, render) in enumerate(zip(self.sets, output.renders, strict=True)):
-            one.optimise(step, render)
-            if c.densify_from < done < c.densify_until and done % c.densify_every == 0:
-                one.densify(generator(self.seed, "split", i, done))
-            if c.opacity_reset_every and since_reset >= 0 and since_reset % c.opacity_reset_every == 0:
-                one.reset_opacity()
+        for strategy, render in zip(self.strategies, output.renders, strict=True):
+            strategy.after_backward(step, render)
         if c.co_prune_every and done > c.densify_from and done % c.co_prune_every == 0:
             self._co_prune(done)
-        for one in self.sets:
-            for hook in self.hooks:
-                one.remove(hook.after_step(one.gaussians(), step))
+        for strategy in self.strategies:
+            strategy.after_step(self.hooks, step)
 
     def _co_prune(self, done: int) -> None:
         gone = unmatched(*(one.means for one in self.sets), self.co_prune_distance)
@@ -118,20 +118,21 @@ class CorgsLite:
                 done,
                 self.co_prune_distance,
             )
-        for one, lonely in zip(self.sets, gone, strict=True):
-            one.remove(lonely)
+        for strategy, lonely in zip(self.strategies, gone, strict=True):
+            strategy.remove(lonely)
 
     @torch.no_grad()
     def render(self, camera: Cameras, background: Tensor) -> Render:
         return rasterise(self.sets[0].gaussians(), camera, background.to(self.device))
 
     def state_dict(self) -> dict[str, Tensor]:
-        return {f"set{i}.{k}": v for i, one in enumerate(self.sets) for k, v in one.state_dict().items()}
+        states = (strategy.state_dict() for strategy in self.strategies)
+        return {f"set{i}.{name}": value for i, state in enumerate(states) for name, value in state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        for i, one in enumerate(self.sets):
+        for i, strategy in enumerate(self.strategies):
             prefix = f"set{i}."
-            one.load_state_dict({k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)})
+            strategy.load_state_dict({k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)})
 
     def export(self, folder: Path) -> list[Path]:
         path = Path(folder) / "point_cloud.ply"

@@ -7,6 +7,7 @@ repair. Hooks, where there are any, give the initial points and add their losses
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,10 +19,10 @@ from visdom_plugin.losses import disparity_loss
 from visdom_plugin.methods.splats.common import draw_background, fit_view, load_kernels, scene_extent
 from visdom_plugin.methods.splats.configs import GsGoConfig
 from visdom_plugin.methods.splats.initial_points import draw_points
+from visdom_plugin.methods.splats.strategy import Schedule, Strategy, every
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
-from visdom_plugin.splat.densify import stray_gaussians
 from visdom_plugin.splat.model import GaussianSet
 from visdom_plugin.splat.ply import write_ply
 from visdom_plugin.splat.rasterise import rasterise
@@ -38,16 +39,23 @@ class GsGo:
     def setup(
         self, views: Views, hooks: Sequence[GaussianHook], *, hull, device: torch.device, seed: int
     ) -> None:
+        c = self.config
         self.device, self.seed, self.hooks = device, seed, list(hooks)
         load_kernels(device)
-        draw = generator(seed, "initial_points")
-        xyz, rgb = draw_points(self.hooks, hull, views, self.config.initial_points, draw)
-        self.splats = GaussianSet(self.config, xyz, rgb, extent=scene_extent(views.cameras), device=device)
+        xyz, rgb = draw_points(self.hooks, hull, views, c.initial_points, generator(seed, "initial_points"))
+        self.splats = GaussianSet(c, xyz, rgb, extent=scene_extent(views.cameras), device=device)
+        schedule = Schedule(
+            reset_opacity=every(c.opacity_reset_every, c.opacity_reset_every, c.densify_until),
+            remove_strays=every(c.floater_every, c.floater_every, c.densify_until),
+            stray_sigmas=c.floater_sigmas,
+            prune_large_from=c.prune_large_from,
+            largest=(c.prune_radius_px, c.prune_scale),
+        )
+        self.strategy = Strategy(self.splats, schedule, partial(generator, seed, "split"))
 
     def train_step(self, batch: ViewBatch, step: int) -> StepOutput:
         c = self.config
-        degree = min(c.sh_degree, step // c.sh_every)
-        gaussians = self.splats.gaussians()
+        degree, gaussians = self.strategy.sh_degree(step), self.splats.gaussians()
         background = draw_background(c, generator(self.seed, "step", step), self.device)
         render = rasterise(gaussians, batch.camera, background, sh_degree=degree)
         losses, psnr = fit_view(render, batch, background, c)
@@ -66,38 +74,20 @@ class GsGo:
 
     @torch.no_grad()
     def optimise(self, step: int, output: StepOutput) -> None:
-        c, done = self.config, step + 1
-        self.splats.optimise(step, output.renders[0])
-        if done < c.densify_until:
-            if done > c.densify_from and done % c.densify_every == 0:
-                large = (c.prune_radius_px, c.prune_scale) if done > c.prune_large_from else None
-                self.splats.densify(generator(self.seed, "split", done), large)
-            if c.floater_every and done % c.floater_every == 0:
-                self._remove_strays(done)
-            if c.opacity_reset_every and done % c.opacity_reset_every == 0:
-                self.splats.reset_opacity()
-        for hook in self.hooks:
-            self.splats.remove(hook.after_step(self.splats.gaussians(), step))
+        self.strategy.after_backward(step, output.renders[0])
+        self.strategy.after_step(self.hooks, step)
 
     @torch.no_grad()
     def render(self, camera: Cameras, background: Tensor) -> Render:
         return rasterise(self.splats.gaussians(), camera, background.to(self.device))
 
     def state_dict(self) -> dict[str, Tensor]:
-        return self.splats.state_dict()
+        return self.strategy.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.splats.load_state_dict(state)
+        self.strategy.load_state_dict(state)
 
     def export(self, folder: Path) -> list[Path]:
         path = Path(folder) / "point_cloud.ply"
         write_ply(path, self.splats.gaussians())
         return [path]
-
-    def _remove_strays(self, done: int) -> None:
-        c = self.config
-        if len(self.splats) < 16:
-            return
-        t = (done - c.floater_every) / max(c.densify_until - c.floater_every, 1)
-        sigmas = c.floater_sigmas[0] + t * (c.floater_sigmas[1] - c.floater_sigmas[0])
-        self.splats.remove(stray_gaussians(self.splats.means, sigmas))
