@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -23,10 +23,17 @@ from visdom_plugin.training.runs.config_io import as_plain, differences
 from visdom_plugin.training.runs.run_directory import RunDir, describe_data
 from visdom_plugin.training.trainer import Trainer, view_psnr
 
+if TYPE_CHECKING:
+    from visdom_plugin.hull.hull import Hull
+
 log = logging.getLogger(__name__)
 
 DataManager = Callable[[Views, int, torch.device], Any]
 """(training views, seed, device) to an object whose `view_batch(step)` and `pixel_batch(step, n)` are pure."""
+
+
+HULL, REFERENCE = "hull.npz", "reference.npz"
+"""In a run's folder hull/: the hull of its method, and that of its metrics where it is another."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -101,9 +108,13 @@ def train(
 
 
 def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds):
-    method, hull, hull_s = build(preset, config, scene.train, device=device, seed=seed)
+    saved = run.path / "hull"
+    method, hull, hull_s = build(preset, config, scene.train, device=device, seed=seed, saved=saved)
     if hull is not None:
-        write_hull(hull, run.path / "hull")
+        write_hull(hull, saved)
+        # Of the run that carved it, not of one that goes on with it.
+        hull_s = run.record.get("timing", {}).get("hull_s", hull_s)
+        run.update(timing={"hull_s": hull_s})
     batches = data_manager(scene.train, seed, device)
     trainer = Trainer(
         method,
@@ -117,7 +128,7 @@ def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoi
     if not trainer.run():
         raise Interrupted
     began = time.monotonic()
-    found = assess(method, config, hull, scene, device=device, folder=run.path / "renders")
+    found = assess(method, config, hull, scene, device=device, run_dir=run.path)
     eval_s = time.monotonic() - began
     export(method, run.path / "export")
     step_ms = 1000 * trainer.train_s / max(trainer.step, 1)
@@ -148,14 +159,24 @@ def _warn_of_changes(before: dict[str, Any], now: dict[str, Any]) -> None:
 
 
 def build(
-    preset: registry.Preset, config: Any, views: Views, *, device: torch.device, seed: int
-) -> tuple[Method, Any, float]:
-    """The method set up on the training views, its hull (None without one), and the carving's seconds."""
-    hull, hull_s = None, 0.0
+    preset: registry.Preset,
+    config: Any,
+    views: Views,
+    *,
+    device: torch.device,
+    seed: int,
+    saved: Path | None = None,
+) -> tuple[Method, Hull | None, float]:
+    """The method set up on the training views, its hull (None without one), and the seconds that took.
+
+    Args:
+        saved: the folder in which the run keeps its hull, if it has one already: it is read, not carved again.
+    """
+    hull, began = None, time.monotonic()
     if getattr(config, "hull", None) is not None:
-        began = time.monotonic()
-        hull = config.hull.carve(*views.silhouettes())
-        hull_s = time.monotonic() - began
+        hull = read_hull(saved / HULL) if saved is not None else None
+        hull = config.hull.carve(*views.silhouettes()) if hull is None else hull
+    hull_s = time.monotonic() - began
     hooks = make_hooks(config, hull, views)
     method = preset.load()(config)
     method.setup(views, hooks, hull=hull, device=device, seed=seed)
@@ -193,20 +214,27 @@ def restore(
         raise CheckpointError(
             "the run has no checkpoint that can be read", where=path, todo="run visdom-train again"
         )
-    method, hull, _ = build(preset, config, views, device=device, seed=seed)
+    method, hull, _ = build(preset, config, views, device=device, seed=seed, saved=Path(path) / "hull")
     method.load_state_dict(found.tensors)
     return method, hull, found.step
 
 
 def assess(
-    method: Method, config: Any, hull: Any, scene: Scene, *, device: torch.device, folder: Path
+    method: Method, config: Any, hull: Hull | None, scene: Scene, *, device: torch.device, run_dir: Path
 ) -> dict[str, Any]:
-    """Metrics and pictures of the test views; see `evaluate`."""
+    """Metrics and pictures of the test views; see `evaluate`.
+
+    The reference hull is carved once per run and kept as hull/reference.npz, unless the method's own is the same.
+    """
     from visdom_plugin.hull.domain import VisibleDomain
 
-    same = hull is not None and config.hull == VisibleDomain()
-    reference = hull if same else carve_reference(scene.train)
-    return evaluate(method, scene.test, reference_hull=reference, device=device, folder=folder)
+    if hull is not None and config.hull == VisibleDomain():
+        reference = hull
+    elif (reference := read_hull(run_dir / "hull" / REFERENCE)) is None:
+        reference = carve_reference(scene.train)
+        if reference is not None:
+            reference.save(run_dir / "hull" / REFERENCE)
+    return evaluate(method, scene.test, reference_hull=reference, device=device, folder=run_dir / "renders")
 
 
 def evaluate_again(
@@ -219,7 +247,7 @@ def evaluate_again(
     """
     with RunDir.open_existing(run_dir) as run:
         began = time.monotonic()
-        found = assess(method, config, hull, scene, device=device, folder=run.path / "renders")
+        found = assess(method, config, hull, scene, device=device, run_dir=run.path)
         timing = run.record.get("timing", {}) | {"eval_s": time.monotonic() - began}
         run.update(metrics=finite(found), timing=timing)
         return run.record
@@ -227,12 +255,25 @@ def evaluate_again(
 
 def write_hull(hull: Any, folder: Path) -> None:
     """hull.npz and hull.ply, each in one step; files that are there already are of the same run."""
-    if not (folder / "hull.npz").exists():
-        with appearing(folder / "hull.npz") as part:
+    if not (folder / HULL).exists():
+        with appearing(folder / HULL) as part:
             hull.save(part)
     if not (folder / "hull.ply").exists():
         with appearing(folder / "hull.ply") as part:
             hull.write_ply(part)
+
+
+def read_hull(path: Path) -> Hull | None:
+    """A hull that a run has saved; None where there is none, or, with a warning, where it cannot be read."""
+    from visdom_plugin.hull.hull import Hull
+
+    if not path.exists():
+        return None
+    try:
+        return Hull.load(path)
+    except CheckpointError as error:
+        log.warning("%s\n  the hull is carved again", error)
+        return None
 
 
 def export(method: Method, folder: Path) -> list[Path]:

@@ -1,6 +1,6 @@
 """The run directory: what a training run leaves on disk, and who may write to it.
 
-    run.json  log.jsonl  checkpoints/  hull/hull.npz  hull/hull.ply  renders/  export/
+    run.json  log.jsonl  checkpoints/  hull/{hull.npz,hull.ply,reference.npz}  renders/  export/
 
 A directory belongs to one config, one seed and one data set. It is resumed by the same, and never resumed or
 overwritten by another unless the user says so.
