@@ -8,7 +8,7 @@ from torch import Tensor
 from visdom_plugin.ssim import ssim
 
 
-def composite_target(
+def composite(
     image: Tensor,
     mask: Tensor,
     background: Tensor,

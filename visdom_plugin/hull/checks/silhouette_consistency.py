@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import parallel_for
+from visdom_plugin.compute.parallel import spread
 from visdom_plugin.hull.checks.distance_fields import Outlines
 
 CAP_PX = 16.0
@@ -53,7 +53,7 @@ def _cut(c0, c1, low, high):
 
 
 @kernel()
-def _follow_rays(
+def _march(
     begin, end, view, uv, motions, centres, intrinsics, projections, sizes, offsets, fields,
     least, near, far, ball, radius, step, whole, without, ends, counts,
 ):  # fmt: skip
@@ -209,8 +209,8 @@ def march_rays(
     )
     whole, without = np.empty(count), np.empty((count, views))
     ends, counts = np.empty((count, 2, 3)), np.ones(count, np.bool_)
-    parallel_for(
-        _follow_rays, count, 64, view, uv, outlines.rotations, outlines.centres, outlines.intrinsics,
+    spread(
+        _march, count, 64, view, uv, outlines.rotations, outlines.centres, outlines.intrinsics,
         outlines.projections, sizes, offsets, fields, least, near, far, centre, radius, step_px,
         whole, without, ends, counts,
     )  # fmt: skip
