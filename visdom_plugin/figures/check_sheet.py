@@ -21,6 +21,9 @@ from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from visdom_plugin.geometry.cameras import Cameras
     from visdom_plugin.hull.checks.check import Check
     from visdom_plugin.scene import Views
 
@@ -37,7 +40,7 @@ _LEGEND = (
 _RESOLUTION = 96
 
 
-def draw_check(views: Views, masks: Sequence, found: Check) -> np.ndarray:
+def draw_check(views: Views, masks: Sequence[Tensor | np.ndarray], found: Check) -> np.ndarray:
     """The sheet, (H, W, 3) uint8 RGB.
 
     Yellow outlines the mask and cyan the hull of the other usable views. Red is foreground whose rays the other
@@ -52,7 +55,9 @@ def draw_check(views: Views, masks: Sequence, found: Check) -> np.ndarray:
             named.setdefault(view, []).append(f"{f.kind} ({'note' if f.note else f.sure})")
     cells = []
     for view in range(len(views)):
-        picture = _draw_view(np.asarray(views.images[view]), masks[view], hulls.get(view), wrong.get(view))
+        picture = _draw_view(
+            np.asarray(views.images[view]), np.asarray(masks[view]), hulls.get(view), wrong.get(view)
+        )
         cells.append((picture, str(views.names[view]), ", ".join(named.get(view, []))))
     tall = max(c[0].shape[0] for c in cells) + _LABEL
     rows = -(-len(cells) // columns)
@@ -76,7 +81,9 @@ def draw_check(views: Views, masks: Sequence, found: Check) -> np.ndarray:
     return sheet.draw()
 
 
-def _hulls_of_others(views: Views, masks: Sequence, found: Check) -> dict[int, np.ndarray]:
+def _hulls_of_others(
+    views: Views, masks: Sequence[Tensor | np.ndarray], found: Check
+) -> dict[int, np.ndarray]:
     """Silhouettes, at the cells' size, of the hull of all usable views but the one."""
     usable = list(found.usable)
     if len(usable) < 2:
@@ -106,7 +113,7 @@ def _hulls_of_others(views: Views, masks: Sequence, found: Check) -> dict[int, n
     return result
 
 
-def _contradicted(views: Views, masks: Sequence, found: Check) -> dict[int, np.ndarray]:
+def _contradicted(views: Views, masks: Sequence[Tensor | np.ndarray], found: Check) -> dict[int, np.ndarray]:
     """Per view, (h, w) bool: where every point of the ray lies beside the mask of another usable view."""
     if found.fit is None or found.fit.ball is None:
         return {}
@@ -131,12 +138,14 @@ def _contradicted(views: Views, masks: Sequence, found: Check) -> dict[int, np.n
     return result
 
 
-def _shrink(mask: np.ndarray, camera) -> np.ndarray:
+def _shrink(mask: np.ndarray, camera: Cameras) -> np.ndarray:
     size = int(camera.width), int(camera.height)
     return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
 
 
-def _draw_view(image: np.ndarray, mask: np.ndarray, hull, wrong) -> np.ndarray:
+def _draw_view(
+    image: np.ndarray, mask: np.ndarray, hull: np.ndarray | None, wrong: np.ndarray | None
+) -> np.ndarray:
     height = max(1, round(image.shape[0] * _CELL / image.shape[1]))
     way = cv2.INTER_AREA if image.shape[1] > _CELL else cv2.INTER_LINEAR
     picture = cv2.resize(np.ascontiguousarray(image), (_CELL, height), interpolation=way).astype(np.float32)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from visdom_plugin.hull.settings import HullSettings
 
 if TYPE_CHECKING:
-    import numpy as np
-    from torch import Tensor
-
     from visdom_plugin.geometry.cameras import Cameras
+    from visdom_plugin.hull.carving.votes import Masks
     from visdom_plugin.hull.hull import Hull
 
 log = logging.getLogger(__name__)
@@ -40,7 +37,7 @@ class VisibleDomain(HullSettings):
     The settings are the fields of `HullSettings`.
     """
 
-    def carve(self, cameras: Cameras, masks: Sequence[Tensor | np.ndarray] | Tensor | np.ndarray) -> Hull:
+    def carve(self, cameras: Cameras, masks: Masks) -> Hull:
         """Carves the hull.
 
         Masks on a CUDA device are voted there voxel by voxel; all others are carved block by block on the CPU,

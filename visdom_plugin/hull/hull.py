@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -38,13 +38,13 @@ class Hull:
     """How it was carved: rule, views, seconds, components; plain numbers and strings."""
     _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", np.array(self.bounds, np.float64))
         object.__setattr__(self, "summary", dict(self.summary))
         _freeze(self.occupancy, self.bounds)
 
     @classmethod
-    def from_grid(cls, array, bounds, summary: dict[str, Any] | None = None) -> Hull:
+    def from_grid(cls, array: Any, bounds: Any, summary: dict[str, Any] | None = None) -> Hull:
         """A hull from any occupancy grid; the array is copied.
 
         Args:
@@ -60,28 +60,28 @@ class Hull:
         return cls._checked(array, bounds, "Hull.from_grid", summary)
 
     @classmethod
-    def _checked(cls, array, bounds, where, summary=None) -> Hull:
+    def _checked(cls, array: Any, bounds: Any, where: object, summary: dict[str, Any] | None = None) -> Hull:
         return cls(check_grid(array, where), check_bounds(bounds, where), summary or {})
 
-    def __getstate__(self):
+    def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_derived": {}}
 
-    def __setstate__(self, state):
+    def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         _freeze(self.occupancy, self.bounds)
 
-    def _once(self, key, make: Callable[[], Any]) -> Any:
+    def _once(self, key: object, make: Callable[[], Any]) -> Any:
         if key not in self._derived:
             self._derived[key] = make()
         return self._derived[key]
 
-    def __eq__(self, other) -> bool:
+    def __eq__(self, other: object) -> bool:
         if not isinstance(other, Hull):
             return NotImplemented
         same = np.array_equal(self.bounds, other.bounds)
         return same and np.array_equal(self.occupancy, other.occupancy)
 
-    __hash__ = None
+    __hash__ = None  # type: ignore[assignment]
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -128,7 +128,7 @@ class Hull:
     def radius(self) -> float:
         """Distance from `centre` to the farthest point of the mesh, scene units; 0 for an empty hull."""
 
-        def measure():
+        def measure() -> float:
             vertices, _ = self.to_mesh()
             return float(np.linalg.norm(vertices - self.centre, axis=1).max(initial=0))
 
@@ -141,7 +141,15 @@ class Hull:
         index = np.array([(w * (np.arange(len(w)) + 0.5)).sum() / w.sum() for w in weights])
         return self.bounds[0] + index * self.voxel_edges
 
-    def contains(self, points, *, margin_voxels: float = 0.0):
+    @overload
+    def contains(self, points: Tensor, *, margin_voxels: float = 0.0) -> Tensor: ...
+
+    @overload
+    def contains(self, points: np.ndarray | Sequence[Any], *, margin_voxels: float = 0.0) -> np.ndarray: ...
+
+    def contains(
+        self, points: Tensor | np.ndarray | Sequence[Any], *, margin_voxels: float = 0.0
+    ) -> Tensor | np.ndarray:
         """Whether points lie in occupied voxels. Points outside the grid do not.
 
         Args:
@@ -166,7 +174,7 @@ class Hull:
         return inside & grid[x, y, z]
 
     def _grid_on(self, device: torch.device, reach: int = 0) -> Tensor:
-        def make():
+        def make() -> Tensor:
             # torch knows no read-only arrays, so the grid is copied even where it does not grow.
             grid = np.pad(self.occupancy, reach)
             if reach:
@@ -190,7 +198,7 @@ class Hull:
             from outside), every edge in exactly two faces. Both are read-only.
         """
 
-        def make():
+        def make() -> tuple[np.ndarray, ...]:
             lower, upper = occupied_box(self.occupancy).astype(int)
             window = tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))
             # A copy also where the window is the whole grid: its kernel is compiled for writable arrays.
@@ -200,7 +208,7 @@ class Hull:
         return self._once("mesh", make)
 
     def _areas(self) -> np.ndarray:
-        def make():
+        def make() -> np.ndarray:
             vertices, faces = self.to_mesh()
             a, b, c = (vertices[faces[:, i]] for i in range(3))
             return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
@@ -318,8 +326,8 @@ def _freeze(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
 
 def occupied_box(occupancy: np.ndarray) -> np.ndarray:
     """(2, 3) int: first and one past the last occupied index per axis; the whole grid where it is empty."""
-    plane = occupancy.any(0)
+    plane = np.asarray(occupancy.any(0))
     if not plane.any():
         return np.array([[0, 0, 0], occupancy.shape])
-    lines = [occupancy.any((1, 2)), plane.any(1), plane.any(0)]
+    lines = [np.asarray(line) for line in (occupancy.any((1, 2)), plane.any(1), plane.any(0))]
     return np.array([[line.argmax() for line in lines], [len(line) - line[::-1].argmax() for line in lines]])

@@ -62,7 +62,7 @@ def _main(argv: Sequence[str]) -> int:
         scene = open_scene(folder, **read_options(options), fill=False, test=False)
         views, masks = carving_views(scene.train)
     except SceneError as error:
-        if not _is_about_a_mask(error, folder):
+        if folder is None or not _is_about_a_mask(error, folder):
             raise
         report = {"scene": folder.name, "views": [], "findings": [_unreadable(error)], "notes": []}
         _show(report, options)
@@ -156,10 +156,10 @@ def _plain(finding: Finding, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _is_about_a_mask(error: SceneError, folder: Path | None) -> bool:
+def _is_about_a_mask(error: SceneError, folder: Path) -> bool:
     """Whether one mask of a scene that is otherwise there made it unreadable."""
     where = error.where
-    if folder is None or not isinstance(where, Path) or not where.is_file():
+    if not isinstance(where, Path) or not where.is_file():
         return False
     return "mask" in error.what and where.resolve().is_relative_to(folder.resolve())
 
@@ -170,7 +170,7 @@ def _unreadable(error: SceneError) -> dict[str, Any]:
     return {
         "kind": kind,
         "what": what,
-        "views": [Path(error.where).stem],
+        "views": [Path(str(error.where)).stem],
         "sure": "certain",
         "evidence": 1.0,
         "todo": error.todo or "",

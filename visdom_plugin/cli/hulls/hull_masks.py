@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import Cameras
 
+if TYPE_CHECKING:
+    from visdom_plugin.hull.hull import Hull
+    from visdom_plugin.scene import Scene
 
-def choose_cameras(which: str, scene, hull, frames: int) -> tuple[Cameras, list[str]]:
+
+def choose_cameras(which: str, scene: Scene, hull: Hull, frames: int) -> tuple[Cameras, list[str]]:
     """Cameras to see the hull with, and a file name without ending for each.
 
     Args:
@@ -30,7 +34,7 @@ def choose_cameras(which: str, scene, hull, frames: int) -> tuple[Cameras, list[
 
 
 def write_masks(
-    hull, cameras: Cameras, names: list[str], folder: Path, *, poses: bool, overwrite: bool = False
+    hull: Hull, cameras: Cameras, names: list[str], folder: Path, *, poses: bool, overwrite: bool = False
 ) -> list[Path]:
     """`<folder>/<name>.png` for each camera, 8 bit, 255 on the hull and 0 beside it; each appears in one step.
 

@@ -9,12 +9,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from visdom_plugin import registry
 from visdom_plugin.cli import entry, options
 from visdom_plugin.cli.early import WORD
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.training.hull_run.config import METHOD, HullRunConfig
+
+if TYPE_CHECKING:
+    from visdom_plugin.scene import Scene
 
 PRESET = registry.Preset(
     METHOD,
@@ -87,7 +91,7 @@ def find_target(root: Path | None, given: str | None, frame: int | None) -> Path
     return None if root is None else find_mesh(root, frame)
 
 
-def with_target(scene, root: Path | None, given: str | None):
+def with_target(scene: Scene, root: Path | None, given: str | None) -> Scene:
     """The scene with the mesh of its true surface, where there is one.
 
     Args:

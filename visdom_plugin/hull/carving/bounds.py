@@ -1,4 +1,4 @@
-"""Where the hull is, from cameras and masks alone: coarse to fine, without a guess at origin or scale.
+"""Bounds of the hull from cameras and masks alone: coarse to fine, without a guess at origin or scale.
 
 The search starts in a cube around the point the cameras look at and judges whole cells, not sample points, so a
 part is never lost for being thinner than a cell. Cells that the rule may keep are split in eight.
@@ -10,11 +10,12 @@ import logging
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hull.carving.culling import explaining_pieces
 from visdom_plugin.hull.carving.keep_rule import KeepRule
-from visdom_plugin.hull.carving.octree import KEPT, MIXED, classify_cells, keep_centres, sum_areas
+from visdom_plugin.hull.carving.octree import KEPT, MIXED, Areas, classify_cells, keep_centres, sum_areas
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes
 from visdom_plugin.hull.grid.components import find_pieces, piece_of
 
@@ -56,7 +57,7 @@ def find_region(
     components: str = "all",
     drop_below: float = 0.0,
     *,
-    areas=None,
+    areas: Areas | None = None,
     effort: float = 1.0,
 ) -> Region | None:
     """The smallest box known to hold the rule's region, or None when no point can satisfy the rule.
@@ -68,12 +69,12 @@ def find_region(
     Args:
         components: which pieces the box must hold: "all"; with "explain" those that explain foreground of their
             own; with any other policy those of not clearly less than `drop_below` of the largest's volume.
-        areas: from `blocks.sum_areas`.
+        areas: from `octree.sum_areas`.
         effort: share of the usual number of cells at which the search gives up.
     """
     areas = sum_areas(silhouettes) if areas is None else areas
-    centre = look_at_point(cameras.to("cpu", dtype=_double())).numpy()
-    reach = float((cameras.centres.double().cpu() - _tensor(centre)).norm(dim=-1).max())
+    centre = look_at_point(cameras.to("cpu", dtype=torch.float64)).numpy()
+    reach = float((cameras.centres.double().cpu() - torch.from_numpy(centre)).norm(dim=-1).max())
     reach = max(reach, 1e-6)
     first = None
     for doubling in range(_DOUBLINGS + 1):
@@ -92,21 +93,15 @@ def find_region(
     return None if first is None else Region(first, False)
 
 
-def _double():
-    import torch
-
-    return torch.float64
-
-
-def _tensor(array):
-    import torch
-
-    return torch.from_numpy(array)
-
-
 def _refine(
-    silhouettes, areas, rule: KeepRule, grid: Grid, components: str, drop_below: float, effort: float
-):
+    silhouettes: Silhouettes,
+    areas: Areas,
+    rule: KeepRule,
+    grid: Grid,
+    components: str,
+    drop_below: float,
+    effort: float,
+) -> tuple[np.ndarray, bool] | None:
     """Box of the region inside one cube and whether it touches the cube's faces, or None."""
     cells = np.stack(np.unravel_index(np.arange(np.prod(grid.shape)), grid.shape), -1)
     settled = np.zeros((0, 3), np.int64)
@@ -136,7 +131,8 @@ def _refine(
         if (tight and across >= _FINEST) or last or len(cells) == whole:
             touches = bool((box[0] <= 0).any() or (box[1] >= np.array(grid.shape)).any())
             return grid.lower + box * grid.voxel, touches
-        grid = Grid(grid.lower, grid.voxel / 2, tuple(2 * n for n in grid.shape))
+        x, y, z = grid.shape
+        grid = Grid(grid.lower, grid.voxel / 2, (2 * x, 2 * y, 2 * z))
         settled, cells = _split(cells[:whole]), _split(cells[whole:])
 
 
@@ -152,7 +148,14 @@ def _split(cells: np.ndarray) -> np.ndarray:
 
 
 def _staying(
-    silhouettes, areas, rule: KeepRule, grid: Grid, cells, inside, components: str, drop_below: float
+    silhouettes: Silhouettes,
+    areas: Areas,
+    rule: KeepRule,
+    grid: Grid,
+    cells: np.ndarray,
+    inside: np.ndarray,
+    components: str,
+    drop_below: float,
 ) -> np.ndarray:
     """(M,) bool: the cells of pieces that the box must hold.
 
@@ -190,4 +193,5 @@ def grid_in(bounds: np.ndarray, resolution: int) -> Grid:
     """Cubic voxels in an explicit box, `resolution` along its longest side; short sides are rounded up."""
     size = bounds[1] - bounds[0]
     voxel = float(size.max()) / resolution
-    return Grid(bounds[0], voxel, tuple(int(n) for n in np.ceil(size / voxel - 1e-9).clip(1)))
+    x, y, z = (int(n) for n in np.ceil(size / voxel - 1e-9).clip(1))
+    return Grid(bounds[0], voxel, (x, y, z))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -12,18 +13,25 @@ from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.bounds import Region, cube_around, find_region, grid_in
 from visdom_plugin.hull.carving.culling import explaining_pieces
 from visdom_plugin.hull.carving.keep_rule import KeepRule
-from visdom_plugin.hull.carving.octree import block_carve, sum_areas
-from visdom_plugin.hull.carving.votes import Grid, Silhouettes, dense_carve
-from visdom_plugin.hull.grid.components import choose_pieces, erase_pieces, find_pieces
+from visdom_plugin.hull.carving.octree import Areas, block_carve, sum_areas
+from visdom_plugin.hull.carving.votes import Device, Grid, Silhouettes, dense_carve
+from visdom_plugin.hull.grid.components import Pieces, choose_pieces, erase_pieces, find_pieces
 from visdom_plugin.hull.hull import Hull, occupied_box
 from visdom_plugin.hull.settings import HullSettings
 
+Ball = tuple[np.ndarray, float]
+"""Centre (3,) and radius, world units."""
 _LOOSE, _TIGHTENINGS = 0.6, 3
 """Share of the grid's side below which what is kept gets a grid of its own, and how often."""
 
 
 def carve_silhouettes(
-    settings: HullSettings, cameras: Cameras, silhouettes: Silhouettes, *, device="cpu", effort: float = 1.0
+    settings: HullSettings,
+    cameras: Cameras,
+    silhouettes: Silhouettes,
+    *,
+    device: Device = "cpu",
+    effort: float = 1.0,
 ) -> Hull | None:
     """The hull, or None when nothing is left; `effort` as in `find_region`."""
     rule = KeepRule.of(settings, len(silhouettes))
@@ -52,7 +60,7 @@ def carve_silhouettes(
         return None
     occupancy, pieces, keep = found
     ended = time.perf_counter()
-    summary = {
+    summary: dict[str, Any] = {
         "kind": settings.kind,
         "views": len(silhouettes),
         "k": rule.least_visible,
@@ -77,8 +85,15 @@ def carve_silhouettes(
 
 
 def _carve_grid(
-    settings: HullSettings, policy: str, silhouettes, rule: KeepRule, areas, grid: Grid, ball, device
-):
+    settings: HullSettings,
+    policy: str,
+    silhouettes: Silhouettes,
+    rule: KeepRule,
+    areas: Areas,
+    grid: Grid,
+    ball: Ball | None,
+    device: Device,
+) -> tuple[np.ndarray, Pieces, np.ndarray] | None:
     """Occupancy after culling, its pieces before and which of them stayed; None for an empty grid."""
     if str(device) == "cpu":
         occupancy = block_carve(silhouettes, grid, rule, areas)
@@ -98,34 +113,38 @@ def _carve_grid(
     return occupancy, pieces, keep
 
 
-def _place(settings: HullSettings, cameras, silhouettes, rule: KeepRule, areas, effort: float):
+def _place(
+    settings: HullSettings,
+    cameras: Cameras,
+    silhouettes: Silhouettes,
+    rule: KeepRule,
+    areas: Areas,
+    effort: float,
+) -> tuple[Grid, Ball | None, bool] | None:
     """Grid, ball (centre, radius) or None, and whether the views close the region; None for no region."""
-    needs_ball = settings.kind == "unit-sphere"
-    given = None if settings.bounds is None else np.array(settings.bounds, np.float64)
-    ball_given = settings.sphere_centre is not None and settings.sphere_radius is not None
-    region = None
-    if given is None or (needs_ball and not ball_given):
-        region = _visible_region(settings, cameras, silhouettes, rule, areas, effort)
-        if region is None:
-            return None
-    ball = None
-    if needs_ball:
-        box = None if region is None else region.bounds
-        centre = (
-            box.mean(0) if settings.sphere_centre is None else np.array(settings.sphere_centre, np.float64)
-        )
-        radius = settings.sphere_radius
-        ball = centre, float(np.linalg.norm(box[1] - box[0]) / 2) if radius is None else float(radius)
-    closed = region is None or region.closed
-    if given is not None:
-        return grid_in(given, settings.resolution), ball, True
+    needs_ball, bounds = settings.kind == "unit-sphere", settings.bounds
+    centre = None if settings.sphere_centre is None else np.array(settings.sphere_centre, np.float64)
+    radius = settings.sphere_radius
+    ball: Ball | None = None
+    if needs_ball and centre is not None and radius is not None:
+        ball = centre, float(radius)
+    if bounds is not None and (ball is not None or not needs_ball):
+        return grid_in(np.array(bounds, np.float64), settings.resolution), ball, True
+    region = _visible_region(settings, cameras, silhouettes, rule, areas, effort)
+    if region is None:
+        return None
     box = region.bounds
+    if needs_ball:
+        reach = float(np.linalg.norm(box[1] - box[0]) / 2) if radius is None else float(radius)
+        ball = box.mean(0) if centre is None else centre, reach
+    if bounds is not None:
+        return grid_in(np.array(bounds, np.float64), settings.resolution), ball, True
     if ball is not None:
         box = np.stack([ball[0] - ball[1], ball[0] + ball[1]])
     elif _one_view_is_enough(settings, rule):
         centres = cameras.centres.double().cpu().numpy()
         box = np.stack([np.minimum(box[0], centres.min(0)), np.maximum(box[1], centres.max(0))])
-    return cube_around(box, settings.resolution), ball, closed
+    return cube_around(box, settings.resolution), ball, region.closed
 
 
 def _one_view_is_enough(settings: HullSettings, rule: KeepRule) -> bool:
@@ -133,7 +152,7 @@ def _one_view_is_enough(settings: HullSettings, rule: KeepRule) -> bool:
 
 
 def _policy(settings: HullSettings, rule: KeepRule) -> str:
-    """What decides about the grid's pieces."""
+    """The policy on the grid's pieces."""
     baseline = settings.kind == "unit-sphere" or _one_view_is_enough(settings, rule)
     return "drop-small" if settings.components == "explain" and baseline else settings.components
 
@@ -150,7 +169,14 @@ def _say_dropped(sizes: np.ndarray, keep: np.ndarray, policy: str, min_fraction:
     return f"dropped {np.count_nonzero(~keep)}, {share:.2g} of the volume kept: {why}"
 
 
-def _visible_region(settings, cameras, silhouettes, rule: KeepRule, areas, effort: float) -> Region | None:
+def _visible_region(
+    settings: HullSettings,
+    cameras: Cameras,
+    silhouettes: Silhouettes,
+    rule: KeepRule,
+    areas: Areas,
+    effort: float,
+) -> Region | None:
     def find(rule: KeepRule) -> Region | None:
         fraction = 0.5 if settings.components == "largest" else settings.min_component_fraction
         return find_region(

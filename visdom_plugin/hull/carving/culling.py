@@ -16,6 +16,7 @@ import numpy as np
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import spread
 from visdom_plugin.hull.carving.keep_rule import KeepRule
+from visdom_plugin.hull.carving.octree import Areas
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes, axis_terms
 from visdom_plugin.hull.grid.components import Pieces
 
@@ -58,7 +59,7 @@ class _Drawn(NamedTuple):
 
 
 def explaining_pieces(
-    pieces: Pieces, occupancy: np.ndarray, grid: Grid, silhouettes: Silhouettes, rule: KeepRule, areas
+    pieces: Pieces, occupancy: np.ndarray, grid: Grid, silhouettes: Silhouettes, rule: KeepRule, areas: Areas
 ) -> np.ndarray:
     """The pieces that explain foreground of their own.
 
@@ -68,7 +69,7 @@ def explaining_pieces(
     Args:
         pieces: of `occupancy`, (X, Y, Z) bool, in `grid`.
         rule: what the pieces satisfy. Undecided cells seldom cover foreground in as many views as it asks for.
-        areas: from `blocks.sum_areas`.
+        areas: from `octree.sum_areas`.
 
     Returns:
         (C,) bool, at least one True where there are pieces.
@@ -104,7 +105,10 @@ def _shell(pieces: Pieces, occupancy: np.ndarray, stretch: np.ndarray) -> tuple[
 
 
 @kernel()
-def _list_shell(begin, end, whole, coarse, grid, starts, runs):
+def _list_shell(
+    begin: int, end: int, whole: np.ndarray, coarse: np.ndarray, grid: np.ndarray, starts: np.ndarray,
+    runs: np.ndarray,
+) -> None:  # fmt: skip
     """Counts in `starts`, or lists from there on in `runs` unless that is empty."""
     nx, ny, _ = grid.shape
     for r in range(begin, end):
@@ -130,7 +134,7 @@ def _list_shell(begin, end, whole, coarse, grid, starts, runs):
             starts[r] = found
 
 
-def _lay_out(silhouettes: Silhouettes, areas, edge_px: np.ndarray, about: np.ndarray) -> _Canvas:
+def _lay_out(silhouettes: Silhouettes, areas: Areas, edge_px: np.ndarray, about: np.ndarray) -> _Canvas:
     """Working pixels as large as a voxel at the point `about` (3,); `edge_px` (N,) is its edge at depth 1."""
     tables, starts = areas
     depth = np.abs(silhouettes.projections[:, 2] @ np.append(about, 1.0))
@@ -150,8 +154,10 @@ def _lay_out(silhouettes: Silhouettes, areas, edge_px: np.ndarray, about: np.nda
 
 @kernel()
 def _trace(
-    begin, end, runs, bounds, stretch, x, y, z, edge_px, factors, sizes, offsets, foreground, starts, pixels
-):
+    begin: int, end: int, runs: np.ndarray, bounds: np.ndarray, stretch: np.ndarray, x: np.ndarray,
+    y: np.ndarray, z: np.ndarray, edge_px: np.ndarray, factors: np.ndarray, sizes: np.ndarray,
+    offsets: np.ndarray, foreground: np.ndarray, starts: np.ndarray, pixels: np.ndarray,
+) -> None:  # fmt: skip
     """Counts in `starts`, or lists from there on in `pixels` unless that is empty, what pieces cover in views."""
     for view in range(begin, end):
         width, height = sizes[view]
@@ -185,7 +191,13 @@ def _trace(
 
 
 def _draw(
-    runs, bounds, stretch, grid: Grid, silhouettes: Silhouettes, canvas: _Canvas, focal: np.ndarray
+    runs: np.ndarray,
+    bounds: np.ndarray,
+    stretch: np.ndarray,
+    grid: Grid,
+    silhouettes: Silhouettes,
+    canvas: _Canvas,
+    focal: np.ndarray,
 ) -> _Drawn:
     terms = axis_terms(silhouettes.projections, [grid.centres(a) for a in range(3)])
     inputs = (runs, bounds, stretch, *terms, focal * grid.voxel, *canvas)

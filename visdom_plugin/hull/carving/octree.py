@@ -21,9 +21,15 @@ _UNSEEN, _EMPTY, _FULL, _OPEN = 0, 1, 2, 3
 _TOP, _LEAF = 32, 4
 _GRAIN = 2048
 
+Areas = tuple[np.ndarray, np.ndarray]
+"""Summed-area tables and where each starts, from `sum_areas`."""
+
 
 @kernel()
-def _sum_areas(begin, end, pixels, sizes, offsets, table_offsets, tables):
+def _sum_areas(
+    begin: int, end: int, pixels: np.ndarray, sizes: np.ndarray, offsets: np.ndarray,
+    table_offsets: np.ndarray, tables: np.ndarray,
+) -> None:  # fmt: skip
     for view in range(begin, end):
         width, height = sizes[view]
         stride = width + 1
@@ -39,7 +45,7 @@ def _sum_areas(begin, end, pixels, sizes, offsets, table_offsets, tables):
                 table[below + column + 1] = table[above + column + 1] + total
 
 
-def sum_areas(silhouettes: Silhouettes) -> tuple[np.ndarray, np.ndarray]:
+def sum_areas(silhouettes: Silhouettes) -> Areas:
     """Summed-area tables of all masks, flat int32, and where each starts.
 
     Entry (r, c) of a table sums rows < r and columns < c.
@@ -52,18 +58,21 @@ def sum_areas(silhouettes: Silhouettes) -> tuple[np.ndarray, np.ndarray]:
     return tables, starts
 
 
-def rounding_bounds(terms) -> np.ndarray:
+def rounding_bounds(terms: tuple[np.ndarray, ...]) -> np.ndarray:
     """(N, 3) bounds on the rounding error of the sum of three terms, with room to spare (64 ulp)."""
-    return sum(np.abs(t).max(-1) for t in terms) * 1.5e-14
+    return np.sum([np.abs(t).max(-1) for t in terms], axis=0) * 1.5e-14
 
 
 @kernel(inline="always")
-def _span(a, b):
+def _span(a: float, b: float) -> tuple[float, float]:
     return 0.5 * (a + b), 0.5 * (b - a)
 
 
 @kernel()
-def _judge(view, i0, i1, j0, j1, k0, k1, x, y, z, slack, sizes, starts, tables):
+def _judge(
+    view: int, i0: int, i1: int, j0: int, j1: int, k0: int, k1: int, x: np.ndarray, y: np.ndarray,
+    z: np.ndarray, slack: np.ndarray, sizes: np.ndarray, starts: np.ndarray, tables: np.ndarray,
+) -> int:  # fmt: skip
     """What one view says of all points with indices i0..i1, j0..j1, k0..k1 (inclusive)."""
     cx, dx = _span(x[view, 2, i0], x[view, 2, i1])
     cy, dy = _span(y[view, 2, j0], y[view, 2, j1])
@@ -113,7 +122,7 @@ def _judge(view, i0, i1, j0, j1, k0, k1, x, y, z, slack, sizes, starts, tables):
 
 
 @kernel()
-def _decide(table, visible, occupied, unsettled):
+def _decide(table: np.ndarray, visible: int, occupied: int, unsettled: int) -> int:
     # A hit never harms; a miss helps K and harms agreement. So the best case is all hits, and in the worst
     # case either all unsettled views miss or none sees the voxel.
     if not table[visible + unsettled, occupied + unsettled]:
@@ -124,7 +133,10 @@ def _decide(table, visible, occupied, unsettled):
 
 
 @kernel()
-def _classify(begin, end, blocks, x, y, z, slack, sizes, starts, tables, table, states):
+def _classify(
+    begin: int, end: int, blocks: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray, slack: np.ndarray,
+    sizes: np.ndarray, starts: np.ndarray, tables: np.ndarray, table: np.ndarray, states: np.ndarray,
+) -> None:  # fmt: skip
     views = len(sizes)
     for b in range(begin, end):
         i, j, k = blocks[b, 0], blocks[b, 1], blocks[b, 2]
@@ -142,7 +154,7 @@ def _classify(begin, end, blocks, x, y, z, slack, sizes, starts, tables, table, 
 
 
 def classify_cells(
-    silhouettes: Silhouettes, areas, grid: Grid, rule: KeepRule, cells: np.ndarray
+    silhouettes: Silhouettes, areas: Areas, grid: Grid, rule: KeepRule, cells: np.ndarray
 ) -> np.ndarray:
     """What the rule says of all points of whole cells, not of their centres alone.
 
@@ -162,7 +174,10 @@ def classify_cells(
 
 
 @kernel()
-def _keep_centres(begin, end, cells, x, y, z, sizes, offsets, pixels, table, kept):
+def _keep_centres(
+    begin: int, end: int, cells: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray, sizes: np.ndarray,
+    offsets: np.ndarray, pixels: np.ndarray, table: np.ndarray, kept: np.ndarray,
+) -> None:  # fmt: skip
     views = len(sizes)
     for b in range(begin, end):
         i, j, k = cells[b, 0], cells[b, 1], cells[b, 2]
@@ -190,27 +205,10 @@ def keep_centres(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, cells: np
 
 @kernel()
 def _vote_leaf(
-    i0,
-    i1,
-    j0,
-    j1,
-    k0,
-    k1,
-    count,
-    open_views,
-    visible,
-    occupied,
-    x,
-    y,
-    z,
-    sizes,
-    offsets,
-    pixels,
-    table,
-    seen,
-    inside,
-    out,
-):
+    i0: int, i1: int, j0: int, j1: int, k0: int, k1: int, count: int, open_views: np.ndarray, visible: int,
+    occupied: int, x: np.ndarray, y: np.ndarray, z: np.ndarray, sizes: np.ndarray, offsets: np.ndarray,
+    pixels: np.ndarray, table: np.ndarray, seen: np.ndarray, inside: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
     n = (i1 - i0) * (j1 - j0) * (k1 - k0)
     for m in range(n):
         seen[m] = visible
@@ -245,7 +243,11 @@ def _vote_leaf(
 
 
 @kernel()
-def _carve(begin, end, x, y, z, slack, sizes, offsets, pixels, starts, tables, table, out):
+def _carve(
+    begin: int, end: int, x: np.ndarray, y: np.ndarray, z: np.ndarray, slack: np.ndarray, sizes: np.ndarray,
+    offsets: np.ndarray, pixels: np.ndarray, starts: np.ndarray, tables: np.ndarray, table: np.ndarray,
+    out: np.ndarray,
+) -> None:  # fmt: skip
     nx, ny, nz = out.shape
     views = len(sizes)
     by, bz = -(-ny // _TOP), -(-nz // _TOP)
@@ -312,7 +314,9 @@ def _carve(begin, end, x, y, z, slack, sizes, offsets, pixels, starts, tables, t
                 height += 1
 
 
-def block_carve(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, areas=None) -> np.ndarray:
+def block_carve(
+    silhouettes: Silhouettes, grid: Grid, rule: KeepRule, areas: Areas | None = None
+) -> np.ndarray:
     """The voxels that satisfy the rule, on the CPU, equal to `votes.dense_carve`.
 
     Work grows with the hull's surface. Pages of the result without a kept voxel are never touched.

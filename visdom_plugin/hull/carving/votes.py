@@ -2,7 +2,7 @@
 
 A view sees a voxel when its centre is in front of the camera and inside the image, 0 <= u < width and
 0 <= v < height; it says "occupied" when the pixel that holds the projection is on the mask. All arithmetic is
-in float64 and in one order, which `blocks` repeats, so that both agree voxel for voxel.
+in float64 and in one order, which `octree` repeats, so that both agree voxel for voxel.
 """
 
 from __future__ import annotations
@@ -18,6 +18,10 @@ from torch import Tensor
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras, require_batch
 from visdom_plugin.hull.carving.keep_rule import KeepRule
+
+Device = torch.device | str
+Masks = Sequence[Tensor | np.ndarray] | Tensor | np.ndarray
+"""N masks (H, W), or one tensor or array (N, H, W)."""
 
 
 class Grid(NamedTuple):
@@ -73,7 +77,7 @@ class Silhouettes:
         )
 
 
-def gather_silhouettes(cameras: Cameras, masks: Sequence, dilate_px: int = 0) -> Silhouettes:
+def gather_silhouettes(cameras: Cameras, masks: Masks, dilate_px: int = 0) -> Silhouettes:
     """Checks and packs cameras and masks.
 
     Args:
@@ -134,7 +138,9 @@ def axis_terms(projections: np.ndarray, coordinates: Sequence[np.ndarray]) -> tu
     return x, y, z + projections[:, :, 3, None]
 
 
-def count_votes(silhouettes: Silhouettes, grid: Grid, device="cpu", chunk: int = 1 << 21):
+def count_votes(
+    silhouettes: Silhouettes, grid: Grid, device: Device = "cpu", chunk: int = 1 << 21
+) -> tuple[Tensor, Tensor]:
     """Votes of every voxel, on any torch device.
 
     Args:
@@ -162,7 +168,7 @@ def count_votes(silhouettes: Silhouettes, grid: Grid, device="cpu", chunk: int =
     return occupied, visible
 
 
-def dense_carve(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, device="cpu") -> Tensor:
+def dense_carve(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, device: Device = "cpu") -> Tensor:
     """(X, Y, Z) bool on `device`: the voxels that satisfy the rule."""
     occupied, visible = count_votes(silhouettes, grid, device)
     table = torch.from_numpy(rule.table().astype(bool)).to(device)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hull.carving.votes import gather_silhouettes
@@ -22,7 +23,7 @@ from visdom_plugin.hull.checks.covisibility import (
 )
 from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines, draw_outlines
 from visdom_plugin.hull.checks.fault_hypotheses import QUIET_PX, Suspicion, find_causes
-from visdom_plugin.hull.checks.findings import Finding, Name
+from visdom_plugin.hull.checks.findings import Finding, Name, Sure
 from visdom_plugin.hull.checks.mask_checks import (
     check_border,
     check_content,
@@ -61,8 +62,8 @@ class Check:
 
 def check(
     cameras: Cameras,
-    masks: Sequence,
-    images: Sequence = (),
+    masks: Sequence[Tensor | np.ndarray],
+    images: Sequence[Tensor | np.ndarray] = (),
     names: Sequence[str] | None = None,
     *,
     k: int | None = None,
@@ -80,33 +81,33 @@ def check(
         brief: a fraction of a second; names a fault but not always its cause, and compares 16 views at most.
         poses: what to say of wrong poses, in the terms of where they are from.
     """
-    masks = [np.asarray(m.detach().cpu() if hasattr(m, "detach") else m).astype(bool) for m in masks]
-    names = Name([f"view {i}" for i in range(len(masks))] if names is None else names)
+    own = [np.asarray(m.detach().cpu() if isinstance(m, Tensor) else m).astype(bool) for m in masks]
+    names = Name([f"view {i}" for i in range(len(own))] if names is None else names)
     sizes = torch.stack([cameras.width, cameras.height], -1).cpu().numpy()
-    found = check_sizes(sizes, masks, names)
+    found = check_sizes(sizes, own, names)
     out = {view for f in found for view in f.views}
-    alone = check_content([m if i not in out else np.eye(2, dtype=bool) for i, m in enumerate(masks)], names)
+    alone = check_content([m if i not in out else np.eye(2, dtype=bool) for i, m in enumerate(own)], names)
     found += alone
     for f in alone:
         if f.kind == "speckled":
-            masks[f.views[0]] = cv2.medianBlur(masks[f.views[0]].astype(np.uint8), 3) > 0
+            own[f.views[0]] = cv2.medianBlur(own[f.views[0]].astype(np.uint8), 3) > 0
     out |= {f.views[0] for f in alone if f.kind != "speckled"}
-    out |= {i for i, m in enumerate(masks) if not m.any()}
-    usable = np.array([i for i in range(len(masks)) if i not in out], np.int64)
-    repeated = _repeated(masks, images, out, names)
+    out |= {i for i, m in enumerate(own) if not m.any()}
+    usable = np.array([i for i in range(len(own)) if i not in out], np.int64)
+    repeated = _repeated(own, images, out, names)
     if brief and len(usable) > _BRIEF_VIEWS:
         usable = usable[np.arange(_BRIEF_VIEWS) * len(usable) // _BRIEF_VIEWS]
-    if len(masks) < 2:
-        found.append(_too_few(len(masks)))
+    if len(own) < 2:
+        found.append(_too_few(len(own)))
     if len(usable) < 2:
         notes, found = _split([*found, *repeated])
         return Check(found, notes, None, None, tuple(usable.tolist()))
     chosen = cameras[torch.from_numpy(usable)]
-    outlines = draw_outlines(chosen, gather_silhouettes(chosen, [masks[i] for i in usable]))
-    inverted, outlines = _inverted(outlines, masks, usable, names)
+    outlines = draw_outlines(chosen, gather_silhouettes(chosen, [own[i] for i in usable]))
+    inverted, outlines = _inverted(outlines, own, usable, names)
     found += inverted
     turned = {v for f in inverted for v in f.views}
-    found += check_border([m if i not in turned else ~m for i, m in enumerate(masks)], names)
+    found += check_border([m if i not in turned else ~m for i, m in enumerate(own)], names)
     causes, fit, left = find_causes(outlines, brief=brief, poses=poses)
     astray = _astray(chosen)
     if astray and _views_alone(causes, fit):
@@ -146,7 +147,9 @@ def _too_few(count: int) -> Finding:
     )
 
 
-def _repeated(masks, images, out: set[int], names: Name) -> list[Finding]:
+def _repeated(
+    masks: Sequence[np.ndarray], images: Sequence[Tensor | np.ndarray], out: set[int], names: Name
+) -> list[Finding]:
     """Photographs and masks that occur twice."""
     pairs = {p: {"mask"} for p in find_repeated(masks) if not out & set(p)}
     for p in find_repeated([np.asarray(i) for i in images]):
@@ -164,7 +167,9 @@ def _repeated(masks, images, out: set[int], names: Name) -> list[Finding]:
     ]
 
 
-def _inverted(outlines: Outlines, masks, usable: np.ndarray, names: Name):
+def _inverted(
+    outlines: Outlines, masks: Sequence[np.ndarray], usable: np.ndarray, names: Name
+) -> tuple[list[Finding], Outlines]:
     """Masks that hold the border of their image, and fit the others no worse when turned over."""
     flagged = [k for k, i in enumerate(usable) if look_inverted(masks[i])]
     if not flagged:
@@ -224,7 +229,9 @@ def _views_alone(causes: list[Suspicion], fit: Coherence) -> bool:
     return wrong and all(c.kind == "view" for c in causes)
 
 
-def _join(repeated: list[Finding], causes: list[Suspicion], usable, names: Name):
+def _join(
+    repeated: list[Finding], causes: list[Suspicion], usable: np.ndarray, names: Name
+) -> tuple[list[Finding], list[Suspicion]]:
     """A view that does not fit because it has another's mask is one fault, not two."""
     pairs = {view: k for k, f in enumerate(repeated) for view in f.views}
     left = []
@@ -283,7 +290,7 @@ def _cause(cause: Suspicion, usable: np.ndarray, names: Name, poses: PoseFaults)
         gain = "as given, no view rules out anything for another; undone they do, and miss each other by "
         gain += f"{_share(cause.after)} of the object's length in the mean"
     ratio = min(cause.after / max(cause.before, 1e-9), 1.0)
-    sure = "certain" if cause.before > _DISAGREE_PX and ratio < 0.1 else "likely"
+    sure: Sure = "certain" if cause.before > _DISAGREE_PX and ratio < 0.1 else "likely"
     sure = "possible" if cause.rivals or cause.others else sure
     todo = dict(poses)[cause.detail] if cause.kind == "axes" else _TODO[cause.kind]
     alternatives = tuple(sorted({kind for kind, _, _ in cause.others}))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import Silhouettes
 
 OBJECT_PX = 128
@@ -45,7 +47,7 @@ class Outlines:
         fields = tuple(self.fields[i] for i in index)
         return Outlines(self.rotations[index], self.centres[index], self.intrinsics[index], fields)
 
-    def with_fields(self, fields) -> Outlines:
+    def with_fields(self, fields: Sequence[np.ndarray]) -> Outlines:
         """Other masks for the same cameras; a field of another size is stretched to its camera's."""
         fitted = []
         for field, own in zip(fields, self.fields, strict=True):
@@ -56,11 +58,11 @@ class Outlines:
         return replace(self, fields=tuple(fitted))
 
 
-def draw_outlines(cameras, silhouettes: Silhouettes) -> Outlines:
+def draw_outlines(cameras: Cameras, silhouettes: Silhouettes) -> Outlines:
     """Distance fields of masks at low resolution, so that a typical object is OBJECT_PX pixels long.
 
     Args:
-        cameras: (N,) Cameras, the ones of `silhouettes`.
+        cameras: (N,) the ones of `silhouettes`.
     """
     sides, lengths = silhouettes.sizes.max(1), []
     for view in range(len(silhouettes)):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
@@ -51,11 +52,14 @@ class Suspicion(NamedTuple):
     """Other causes (kind, views, detail) that fit equally well."""
 
 
+Change = Callable[[Outlines], Outlines]
+
+
 class _Trial(NamedTuple):
     kind: str
     views: tuple[int, ...]
     detail: str
-    change: Callable[[Outlines], Outlines]
+    change: Change
 
 
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -93,8 +97,8 @@ def find_causes(
             left[index[list(views)]] = False
             fit = measure_coherence(outlines.keep(left), rays)
             break
-        views = tuple(int(index[i]) for i in cause.views)
-        found.append(cause._replace(views=views, rivals=tuple(int(index[i]) for i in cause.rivals)))
+        concerned = tuple(int(index[i]) for i in cause.views)
+        found.append(cause._replace(views=concerned, rivals=tuple(int(index[i]) for i in cause.rivals)))
         if cause.kind == "view":
             left[index[~stays]] = False
             if cause.rivals:
@@ -107,7 +111,9 @@ def find_causes(
     return found, fit, left
 
 
-def _best_cause(outlines: Outlines, fit: Coherence, rays: int, brief: bool, poses: PoseFaults):
+def _best_cause(
+    outlines: Outlines, fit: Coherence, rays: int, brief: bool, poses: PoseFaults
+) -> tuple[Suspicion | None, Outlines, np.ndarray]:
     """The cause that explains most, the changed outlines and the views that stay; (None, ...) for none."""
     count, before = len(outlines), fit.score
     silent = before <= QUIET_PX
@@ -211,7 +217,7 @@ def _whole_trials(
         for whole in (False, True):
             what = "the focal lengths and principal points" if whole else "the focal lengths"
             yield _Trial("scale", everyone, f"{what} are {1 / scale:.3g} times what they should be",
-                         lambda o, s=scale, w=whole: _scaled(o, s, w))  # fmt: skip
+                         partial(_scaled, factor=scale, whole=whole))  # fmt: skip
     if count >= 3:
         for shift in (-1, 1):
             order = np.roll(np.arange(count), shift)
@@ -220,10 +226,10 @@ def _whole_trials(
                 "order",
                 everyone,
                 f"each view has the mask of the {way} it",
-                lambda o, p=order: _ordered(o, p),
+                partial(_ordered, order=order),
             )
         order = np.arange(count)[::-1]
-        yield _Trial("order", everyone, "the masks are in reverse order", lambda o, p=order: _ordered(o, p))
+        yield _Trial("order", everyone, "the masks are in reverse order", partial(_ordered, order=order))
     suspects = np.arange(count)
     if count > _ALL_PAIRS:
         blame = np.argsort(alone)[:5], np.argsort(-np.nan_to_num(fit.whole))[:3]
@@ -231,13 +237,13 @@ def _whole_trials(
     for a, b in combinations(suspects.tolist() if count >= 3 else [], 2):
         order = np.arange(count)
         order[[a, b]] = b, a
-        yield _Trial("swapped", (a, b), "their masks fit when exchanged", lambda o, p=order: _ordered(o, p))
+        yield _Trial("swapped", (a, b), "their masks fit when exchanged", partial(_ordered, order=order))
 
 
 def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence, poses: PoseFaults) -> str:
     """What would mend one view, or nothing."""
 
-    def one(change):
+    def one(change: Change) -> Outlines:
         changed = change(outlines)
         fields = tuple(f if i != view else changed.fields[i] for i, f in enumerate(outlines.fields))
         pick = np.arange(len(outlines)) == view
@@ -252,7 +258,7 @@ def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence, pose
     trials += [
         (
             f"its focal length is {1 / s:.3g} times what it should be",
-            lambda o, s=s: _scaled(o, s, False),
+            partial(_scaled, factor=s, whole=False),
         )
         for s in (1 / 4, 1 / 2, 2, 4)
     ]
@@ -289,7 +295,7 @@ def _inverse(outlines: Outlines) -> Outlines:
     )
 
 
-_AXES: tuple[Callable[[Outlines], Outlines], ...] = (
+_AXES: tuple[Change, ...] = (
     lambda o: _turned(o, _FLIP),
     _inverse,
     lambda o: _turned(_inverse(o), _FLIP),
@@ -311,7 +317,7 @@ def _ordered(outlines: Outlines, order: np.ndarray) -> Outlines:
     return outlines.with_fields([outlines.fields[i] for i in order])
 
 
-def _fields(outlines: Outlines, change) -> Outlines:
+def _fields(outlines: Outlines, change: Callable[[np.ndarray], np.ndarray]) -> Outlines:
     return replace(outlines, fields=tuple(np.ascontiguousarray(change(f)) for f in outlines.fields))
 
 

@@ -29,21 +29,12 @@ class Finding(NamedTuple):
     """True for what is worth knowing but harms nothing: it does not make a capture faulty."""
 
 
-class Name(Sequence):
+class Name(list[str]):
     """Names of views for sentences."""
-
-    def __init__(self, names: Sequence[str]):
-        self._names = list(names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __getitem__(self, index):
-        return self._names[index]
 
     def all_of(self, views: Sequence[int], most: int = 6) -> str:
         """ "a", "a and b", "a, b and c", "a, b, ... (9 in all)"."""
-        names = [self._names[i] for i in views]
+        names = [self[i] for i in views]
         if len(names) > most:
             return ", ".join(names[:most]) + f", ... ({len(names)} in all)"
         return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]

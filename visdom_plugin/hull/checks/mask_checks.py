@@ -106,7 +106,8 @@ def check_border(masks: Sequence[np.ndarray], names: Name) -> list[Finding]:
 
 def find_repeated(arrays: Sequence[np.ndarray]) -> list[tuple[int, int]]:
     """Pairs of positions whose arrays are equal in shape and content; the first against each later one."""
-    first, pairs = {}, []
+    first: dict[tuple[tuple[int, ...], bytes], int] = {}
+    pairs = []
     for view, array in enumerate(arrays):
         key = (array.shape, hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).digest())
         if key in first:

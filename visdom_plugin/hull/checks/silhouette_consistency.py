@@ -1,4 +1,4 @@
-"""How well silhouettes and cameras fit each other, ray by ray.
+"""Silhouette consistency: how well silhouettes and cameras fit each other, ray by ray.
 
 Every ray through a mask meets the object, so some point of it must lie inside the masks of all views that see
 it (silhouette coherence; Hernandez, Schmitt and Cipolla, PAMI 2007). A ray's residual is how far, in pixels,
@@ -41,7 +41,7 @@ class Residuals(NamedTuple):
 
 
 @kernel()
-def _cut(c0, c1, low, high):
+def _cut(c0: float, c1: float, low: float, high: float) -> tuple[float, float]:
     """The part of [low, high] where c0 + c1 t >= 0."""
     if c1 > 0:
         low = max(low, -c0 / c1)
@@ -54,9 +54,11 @@ def _cut(c0, c1, low, high):
 
 @kernel()
 def _march(
-    begin, end, view, uv, motions, centres, intrinsics, projections, sizes, offsets, fields,
-    least, near, far, ball, radius, step, whole, without, ends, counts,
-):  # fmt: skip
+    begin: int, end: int, view: np.ndarray, uv: np.ndarray, motions: np.ndarray, centres: np.ndarray,
+    intrinsics: np.ndarray, projections: np.ndarray, sizes: np.ndarray, offsets: np.ndarray,
+    fields: np.ndarray, least: int, near: float, far: float, ball: np.ndarray, radius: float, step: float,
+    whole: np.ndarray, without: np.ndarray, ends: np.ndarray, counts: np.ndarray,
+) -> None:  # fmt: skip
     views = len(sizes)
     start, slope, rate = np.empty((views, 3)), np.empty((views, 3)), np.empty(views)
     for r in range(begin, end):
@@ -167,6 +169,7 @@ def choose_pixels(
     """
     views, pixels = [], []
     for i, field in enumerate(outlines.fields):
+        groups: tuple[np.ndarray, ...]
         if beside:
             groups = (np.flatnonzero((field > _BESIDE_PX[0]) & (field < _BESIDE_PX[1])),)
         else:
@@ -186,7 +189,13 @@ def choose_pixels(
 
 
 def march_rays(
-    outlines: Outlines, view: np.ndarray, uv: np.ndarray, *, least: int, ball=None, step_px: float = 1.0
+    outlines: Outlines,
+    view: np.ndarray,
+    uv: np.ndarray,
+    *,
+    least: int,
+    ball: tuple[np.ndarray, float] | None = None,
+    step_px: float = 1.0,
 ) -> Residuals:
     """Residuals of rays against the other views.
 

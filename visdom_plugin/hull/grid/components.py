@@ -6,6 +6,7 @@ diagonally through the grid stays one piece.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +34,7 @@ class Pieces(NamedTuple):
 
 
 @kernel()
-def _count_runs(begin, end, grid, counts):
+def _count_runs(begin: int, end: int, grid: np.ndarray, counts: np.ndarray) -> None:
     _, ny, nz = grid.shape
     for x in range(begin, end):
         for y in range(ny):
@@ -47,7 +48,10 @@ def _count_runs(begin, end, grid, counts):
 
 
 @kernel()
-def _list_runs(begin, end, grid, words, starts, begins, ends):
+def _list_runs(
+    begin: int, end: int, grid: np.ndarray, words: np.ndarray, starts: np.ndarray, begins: np.ndarray,
+    ends: np.ndarray,
+) -> None:  # fmt: skip
     _, ny, nz = grid.shape
     for x in range(begin, end):
         for y in range(ny):
@@ -75,7 +79,7 @@ def _list_runs(begin, end, grid, words, starts, begins, ends):
 
 
 @kernel()
-def _root(parents, r):
+def _root(parents: np.ndarray, r: int) -> int:
     while parents[r] != r:
         parents[r] = parents[parents[r]]
         r = parents[r]
@@ -83,7 +87,9 @@ def _root(parents, r):
 
 
 @kernel()
-def _join(nx, ny, starts, begins, ends, parents):
+def _join(
+    nx: int, ny: int, starts: np.ndarray, begins: np.ndarray, ends: np.ndarray, parents: np.ndarray,
+) -> None:  # fmt: skip
     for x in range(nx):
         for y in range(ny):
             here, stop = starts[x * ny + y], starts[x * ny + y + 1]
@@ -105,7 +111,9 @@ def _join(nx, ny, starts, begins, ends, parents):
 
 
 @kernel()
-def _number(begins, ends, parents, labels, sizes):
+def _number(
+    begins: np.ndarray, ends: np.ndarray, parents: np.ndarray, labels: np.ndarray, sizes: np.ndarray,
+) -> int:  # fmt: skip
     count = 0
     for r in range(len(parents)):
         root = _root(parents, r)
@@ -119,7 +127,10 @@ def _number(begins, ends, parents, labels, sizes):
 
 
 @kernel()
-def _erase(begin, end, grid, starts, begins, ends, labels, keep):
+def _erase(
+    begin: int, end: int, grid: np.ndarray, starts: np.ndarray, begins: np.ndarray, ends: np.ndarray,
+    labels: np.ndarray, keep: np.ndarray,
+) -> None:  # fmt: skip
     ny = grid.shape[1]
     for x in range(begin, end):
         for y in range(ny):
@@ -139,7 +150,7 @@ def find_pieces(occupancy: np.ndarray) -> Pieces:
     words = grid.view(np.uint64) if aligned else np.zeros((1, 1, 0), np.uint64)
     spread(_list_runs, len(grid), _GRAIN, grid, words, starts, begins, ends)
     parents = np.arange(starts[-1])
-    _join(*grid.shape[:2], starts, begins, ends, parents)
+    _join(grid.shape[0], grid.shape[1], starts, begins, ends, parents)
     labels, sizes = np.empty(starts[-1], np.int32), np.zeros(starts[-1], np.int64)
     count = _number(begins, ends, parents, labels, sizes)
     return Pieces(sizes[:count].copy(), starts, begins, ends, labels)
@@ -152,7 +163,10 @@ def erase_pieces(occupancy: np.ndarray, pieces: Pieces, keep: np.ndarray) -> Non
 
 
 @kernel()
-def _look_up(begin, end, voxels, ny, starts, begins, ends, labels, out):
+def _look_up(
+    begin: int, end: int, voxels: np.ndarray, ny: int, starts: np.ndarray, begins: np.ndarray,
+    ends: np.ndarray, labels: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
     for m in range(begin, end):
         column, z = voxels[m, 0] * ny + voxels[m, 1], voxels[m, 2]
         out[m] = -1
@@ -161,7 +175,7 @@ def _look_up(begin, end, voxels, ny, starts, begins, ends, labels, out):
                 out[m] = labels[r]
 
 
-def piece_of(voxels: np.ndarray, shape, pieces: Pieces) -> np.ndarray:
+def piece_of(voxels: np.ndarray, shape: Sequence[int], pieces: Pieces) -> np.ndarray:
     """(M,) piece of each of some voxels (M, 3) int64 of a grid, -1 where there is none."""
     out = np.empty(len(voxels), np.int64)
     inputs = (shape[1], pieces.column_starts, pieces.begins, pieces.ends, pieces.labels)

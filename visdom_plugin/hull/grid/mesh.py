@@ -42,10 +42,14 @@ def _segments(case: int) -> dict[int, int]:
                 end = start
                 while inside[(end + 1) % 4]:
                     end += 1
-                before = _EDGES.index(tuple(sorted((ring[start - 1], ring[start]))))
-                after = _EDGES.index(tuple(sorted((ring[end % 4], ring[(end + 1) % 4]))))
-                following[before] = after
+                following[_edge_of(ring[start - 1], ring[start])] = _edge_of(
+                    ring[end % 4], ring[(end + 1) % 4]
+                )
     return following
+
+
+def _edge_of(a: int, b: int) -> int:
+    return _EDGES.index((min(a, b), max(a, b)))
 
 
 def _loops(case: int) -> list[list[int]]:
@@ -69,7 +73,7 @@ def _share_face(a: int, b: int) -> bool:
 def _triangulate(loop: list[int]) -> list[tuple[int, int, int]] | None:
     """Triangles of a polygon whose diagonals keep off the cube's faces, or None."""
     if len(loop) == 3:
-        return [tuple(loop)]
+        return [(loop[0], loop[1], loop[2])]
     n = len(loop)
     for ear in range(n):
         before, after = loop[ear - 1], loop[(ear + 1) % n]
@@ -85,7 +89,7 @@ def _cases() -> tuple[np.ndarray, np.ndarray]:
     """Triangles (256, 5, 3) as edges 0..11, and how many of them each case has."""
     triangles, counts = np.zeros((256, _MOST_TRIANGLES, 3), np.int64), np.zeros(256, np.int64)
     for case in range(256):
-        found = [t for loop in _loops(case) for t in _triangulate(loop)]
+        found = [t for loop in _loops(case) for t in _triangulate(loop) or ()]
         counts[case] = len(found)
         if found:
             triangles[case, : len(found)] = found
@@ -97,7 +101,7 @@ _EDGE_OFFSETS = _CORNERS[[a for a, _ in _EDGES]]
 
 
 @kernel(inline="always")
-def _case_at(grid, i, j, k):
+def _case_at(grid: np.ndarray, i: int, j: int, k: int) -> int:
     # Cube (i, j, k) has voxel centres i - 1 and i along x, and so on; beyond the grid all is empty.
     nx, ny, nz = grid.shape
     case = 0
@@ -109,7 +113,7 @@ def _case_at(grid, i, j, k):
 
 
 @kernel(inline="always")
-def _next_cube(grid, i, j, k):
+def _next_cube(grid: np.ndarray, i: int, j: int, k: int) -> int:
     """The first k' >= k at which the four columns around the cube's corner change between k' - 1 and k'."""
     nx, ny, nz = grid.shape
     if 1 <= i < nx and 1 <= j < ny:
@@ -129,7 +133,10 @@ def _next_cube(grid, i, j, k):
 
 
 @kernel()
-def _count_slabs(begin, end, grid, counts, triangles_of, vertices_of):
+def _count_slabs(
+    begin: int, end: int, grid: np.ndarray, counts: np.ndarray, triangles_of: np.ndarray,
+    vertices_of: np.ndarray,
+) -> None:  # fmt: skip
     _, ny, nz = grid.shape
     for i in range(begin, end):
         triangles, vertices = 0, 0
@@ -150,7 +157,7 @@ def _count_slabs(begin, end, grid, counts, triangles_of, vertices_of):
 
 
 @kernel()
-def _number_slab(grid, i, first, ids, vertices):
+def _number_slab(grid: np.ndarray, i: int, first: int, ids: np.ndarray, vertices: np.ndarray) -> None:
     """Numbers and places the vertices that slab i owns."""
     _, ny, nz = grid.shape
     count = first
@@ -172,8 +179,10 @@ def _number_slab(grid, i, first, ids, vertices):
 
 @kernel()
 def _build(
-    first, last, grid, chunks, table, counts, axes, offsets, first_triangle, first_vertex, vertices, faces
-):
+    first: int, last: int, grid: np.ndarray, chunks: int, table: np.ndarray, counts: np.ndarray,
+    axes: np.ndarray, offsets: np.ndarray, first_triangle: np.ndarray, first_vertex: np.ndarray,
+    vertices: np.ndarray, faces: np.ndarray,
+) -> None:  # fmt: skip
     nx, ny, nz = grid.shape
     for chunk in range(first, last):
         begin, end = chunk * (nx + 1) // chunks, (chunk + 1) * (nx + 1) // chunks
@@ -229,7 +238,7 @@ def mesh_grid(occupancy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
-def is_closed(faces) -> bool:
+def is_closed(faces: np.ndarray) -> bool:
     """Whether every edge of a mesh (F, 3) is in exactly two faces, which run along it in opposite directions."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     count = int(edges.max(initial=0)) + 1

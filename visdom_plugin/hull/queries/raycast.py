@@ -56,7 +56,7 @@ class Bricks(NamedTuple):
 
 
 @kernel()
-def _pack(begin, end, grid, bits):
+def _pack(begin: int, end: int, grid: np.ndarray, bits: np.ndarray) -> None:
     nx, ny, nz = grid.shape
     for a in range(begin, end):
         for x in range(4 * a, min(4 * a + 4, nx)):
@@ -68,7 +68,7 @@ def _pack(begin, end, grid, bits):
 
 
 @kernel()
-def _look_ahead(begin, end, bits, ahead):
+def _look_ahead(begin: int, end: int, bits: np.ndarray, ahead: np.ndarray) -> None:
     """Largest empty cubes by dynamic programming: one more than the smallest of the seven bricks ahead."""
     na, nb, nc = bits.shape
     for octant in range(begin, end):
@@ -83,7 +83,7 @@ def _look_ahead(begin, end, bits, ahead):
                     for n in range(1, 8):
                         u, v, w = a + i * (n & 1), b + j * (n >> 1 & 1), c + k * (n >> 2)
                         if 0 <= u < na and 0 <= v < nb and 0 <= w < nc:
-                            best = min(best, np.int64(ahead[octant, u, v, w]))
+                            best = min(best, int(ahead[octant, u, v, w]))
                     ahead[octant, a, b, c] = 0 if bits[a, b, c] else best + 1
 
 
@@ -97,7 +97,10 @@ def build_bricks(occupancy: np.ndarray) -> Bricks:
 
 
 @kernel()
-def _walk_pack(count, rays, turns, hit, active, size, bits, ahead):
+def _walk_pack(
+    count: int, rays: np.ndarray, turns: np.ndarray, hit: np.ndarray, active: np.ndarray, size: np.ndarray,
+    bits: np.ndarray, ahead: np.ndarray,
+) -> None:  # fmt: skip
     """Finds where rays first are in an occupied voxel, in a grid turned so that none goes back; units of voxels.
 
     Args:
@@ -149,12 +152,15 @@ def _walk_pack(count, rays, turns, hit, active, size, bits, ahead):
             rays[r, 12] = begin if full else t
             on = (not full) & (t < rays[r, 13]) & (qx < size[0]) & (qy < size[1]) & (qz < size[2])
             active[kept] = r
-            kept += np.int64(on)
+            kept += int(on)
         count = kept
 
 
 @kernel(inline="always")
-def _set_out(rays, turns, n, begin, end, size, shape):
+def _set_out(
+    rays: np.ndarray, turns: np.ndarray, n: int, begin: float, end: float, size: np.ndarray,
+    shape: np.ndarray,
+) -> None:  # fmt: skip
     """Fills in the rest of a ray from its origin and direction in the grid as it is."""
     turns[n, 3], turns[n, 4], octant = 0, 0, 0
     factor = 1
@@ -179,7 +185,7 @@ def _set_out(rays, turns, n, begin, end, size, shape):
 
 
 @kernel(inline="always")
-def _clip_axis(o, d, low, high, near, far):
+def _clip_axis(o: float, d: float, low: float, high: float, near: float, far: float) -> tuple[float, float]:
     if d == 0:
         return (near, far) if low <= o < high else (1.0, 0.0)
     inverse = 1.0 / d
@@ -189,7 +195,11 @@ def _clip_axis(o, d, low, high, near, far):
 
 
 @kernel()
-def _cast(begin, end, origins, directions, lower, scale, box, shape, bits, ahead, both, first, last, hit):
+def _cast(
+    begin: int, end: int, origins: np.ndarray, directions: np.ndarray, lower: np.ndarray, scale: np.ndarray,
+    box: np.ndarray, shape: np.ndarray, bits: np.ndarray, ahead: np.ndarray, both: bool, first: np.ndarray,
+    last: np.ndarray, hit: np.ndarray,
+) -> None:  # fmt: skip
     # One origin may serve all rays of a camera.
     step = 0 if len(origins) == 1 else 1
     size = np.array([4.0 * shape[0], 4.0 * shape[1], 4.0 * shape[2]])
@@ -236,7 +246,7 @@ def _cast(begin, end, origins, directions, lower, scale, box, shape, bits, ahead
                 last[index[n]] = ends[n, 6] - rays[n, 12] if met[n] else first[index[n]]
 
 
-def cast(hull: Hull, origins, directions) -> Crossing:
+def cast(hull: Hull, origins: Tensor | np.ndarray, directions: Tensor | np.ndarray) -> Crossing:
     """First entry into and last exit from the occupied voxels, exact to rounding.
 
     On the CPU numba walks the voxels, on CUDA `cast_with_torch` does it in torch.
@@ -258,21 +268,24 @@ def cast(hull: Hull, origins, directions) -> Crossing:
     return Crossing(first.to(dtype), last.to(dtype), hit)
 
 
-def _walk(hull: Hull, origins: Tensor, directions: Tensor, shape, *, both: bool):
+def _walk(
+    hull: Hull, origins: Tensor, directions: Tensor, shape: tuple[int, ...], *, both: bool
+) -> tuple[Tensor, Tensor, Tensor]:
     origins = origins.reshape(1, 3) if origins.numel() == 3 else origins.expand(*shape, 3).reshape(-1, 3)
     directions = directions.expand(*shape, 3).reshape(-1, 3)
     if directions.dtype != torch.float32 or origins.dtype != torch.float32:
         directions, origins = directions.double(), origins.double()
-    directions, origins = directions.contiguous().numpy(), origins.contiguous().numpy()
     bricks = hull._once("bricks", lambda: build_bricks(hull.occupancy))
     first, last = np.empty(len(directions)), np.empty(len(directions))
     hit = np.empty(len(directions), np.bool_)
     lower, scale = np.array(hull.bounds[0]), 1 / hull.voxel_edges
     box = hull._once("box", lambda: occupied_box(hull.occupancy).astype(float))
     shaped = (np.array(bricks.bits.shape), bricks.bits.reshape(-1), bricks.ahead.reshape(-1))
-    inputs = (origins, directions, lower, scale, box, *shaped, both)
+    rays = (origins.contiguous().numpy(), directions.contiguous().numpy())
+    inputs = (*rays, lower, scale, box, *shaped, both)
     spread(_cast, len(directions), _GRAIN, *inputs, first, last, hit)
-    return tuple(torch.from_numpy(x).reshape(shape) for x in (first, last, hit))
+    near, far, met = (torch.from_numpy(x).reshape(shape) for x in (first, last, hit))
+    return near, far, met
 
 
 def cast_with_torch(hull: Hull, origins: Tensor, directions: Tensor) -> Crossing:

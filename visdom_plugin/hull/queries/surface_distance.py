@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +62,9 @@ def enclosed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
-def fill_mesh(vertices: np.ndarray, faces: np.ndarray, bounds: np.ndarray, shape) -> np.ndarray:
+def fill_mesh(
+    vertices: np.ndarray, faces: np.ndarray, bounds: np.ndarray, shape: Sequence[int]
+) -> np.ndarray:
     """(X, Y, Z) bool: the voxels whose centres an even-odd count finds inside a closed mesh.
 
     Args:
@@ -99,7 +102,7 @@ def overlap(hull: Hull, vertices: np.ndarray, faces: np.ndarray) -> dict[str, fl
 
 
 @kernel()
-def _turn_columns(vertices, faces, turns):
+def _turn_columns(vertices: np.ndarray, faces: np.ndarray, turns: np.ndarray) -> None:
     """Turns over, for each crossing of a column of centres with a face, the first voxel at or above it."""
     nx, ny, nz = turns.shape
     for f in range(len(faces)):
