@@ -64,8 +64,7 @@ def _main(argv: Sequence[str]) -> int:
     except SceneError as error:
         if folder is None or not _is_about_a_mask(error, folder):
             raise
-        report = {"scene": folder.name, "views": [], "findings": [_unreadable(error)], "notes": []}
-        _show(report, options)
+        _show({"scene": folder.name, "views": [], "findings": [_unreadable(error)], "notes": []}, options)
         return FOUND
     loaded = time.perf_counter()
     k = None if options.k == "auto" else options.k
