@@ -53,6 +53,26 @@ def test_json_is_one_object_with_what_is_promised(scene, capsys):
     )
 
 
+def test_the_shape_inside_is_reported_and_written_like_a_hull(scene, capsys, tmp_path):
+    words = ["somewhere", "--resolution", "48", "-k", "2"]
+    assert main([*words, "--json"]) == 0
+    hull = json.loads(capsys.readouterr().out)
+    assert main([*words, "--inside", "--json", "--out", str(tmp_path / "inner.ply")]) == 0
+    inner = json.loads(capsys.readouterr().out)
+    assert (hull["kind"], inner["kind"]) == ("visdom", "inside")
+    assert inner["hull_volume"] == hull["volume"] > inner["volume"] > 0
+    assert inner["bounds"] == hull["bounds"] and inner["watertight"] is True
+    assert all(inner["coverage"][name] > share - 0.005 for name, share in hull["coverage"].items())
+    assert trimesh.load(tmp_path / "inner.ply").volume == pytest.approx(inner["volume"], rel=0.1)
+    assert main([*words, "--inside"]) == 0
+    assert "of the hull's volume" in capsys.readouterr().out
+
+
+def test_the_shape_inside_of_what_one_view_sees_is_refused(scene, capsys):
+    assert main(["somewhere", "--resolution", "48", "-k", "1", "--inside"]) == 2
+    assert "k of 2 or more" in capsys.readouterr().err
+
+
 def test_test_views_are_read_only_for_masks_seen_by_their_cameras(scene, tmp_path):
     words = ["somewhere", "--resolution", "32", "--quiet"]
     for more in (

@@ -55,6 +55,8 @@ class Options(FolderOptions):
     """Centre of the ball of --kind unit-sphere, world units."""
     sphere_radius: float | None = None
     """Radius of that ball."""
+    inside: bool = False
+    """Report and write the smoothest full shape inside the hull that covers as much of the masks, not the hull."""
     out: Path | None = None
     """File to write: .ply for the mesh, .npz for the grid."""
     masks_out: Path | None = None
@@ -100,7 +102,9 @@ def _main(argv: Sequence[str]) -> None:
         fill=False,
         test=masks is not None and masks.cameras == "test",
     )
-    report = report_hull(domain, scene, out=options.out, diagnosing=options.diagnose, masks=masks)
+    report = report_hull(
+        domain, scene, out=options.out, diagnosing=options.diagnose, masks=masks, inside=options.inside
+    )
     if options.json:
         sys.stdout.write(json.dumps(report) + "\n")
     elif not options.quiet:
@@ -124,8 +128,9 @@ def report_hull(
     out: Path | None = None,
     diagnosing: bool = False,
     masks: MaskRequest | None = None,
+    inside: bool = False,
 ) -> dict[str, Any]:
-    """Carves, measures and writes one hull and its masks.
+    """Carves, measures and writes one hull, or the shape inside it, and its masks.
 
     Returns:
         Plain numbers and lists, ready for JSON.
@@ -138,14 +143,18 @@ def report_hull(
     views = scene.train
     cameras, silhouettes = views.silhouettes()
     names = [n for i, n in enumerate(views.names) if views.mask_origin(i) == "given"]
-    hull = domain.carve(cameras, silhouettes)
+    hull = outer = domain.carve(cameras, silhouettes)
+    if inside:
+        from visdom_plugin.hull.inside.shape import shape_inside
+
+        hull = shape_inside(outer, cameras, silhouettes)
     coverage = measure_coverage(hull, cameras, silhouettes)
     summary = hull.summary
     report = {
         "scene": scene.name,
         "views": names,
         "masks": [*describe_masks(views), *scene.notes],
-        "kind": domain.kind,
+        "kind": summary["kind"],
         "k": summary["k"],
         "voxels": hull.voxels,
         "volume": hull.volume,
@@ -167,6 +176,12 @@ def report_hull(
         "watertight": is_closed(hull.to_mesh()[1]),
         "agreement_means": summary["agreement_means"],
     }
+    if inside:
+        report |= {
+            "hull_volume": outer.volume,
+            "hull_seconds": outer.summary["seconds"],
+            "radius": summary["radius"],
+        }
     if diagnosing:
         report["diagnosis"] = _diagnose(scene, report)
     if out is not None:
@@ -185,7 +200,7 @@ def report_hull(
 def _diagnose(scene: Scene, report: dict[str, Any]) -> dict[str, Any]:
     """What the check finds, and where the hull falls short of the masks."""
     views, masks = carving_views(scene.train)
-    k = report["k"] if report["kind"] == "visdom" else None
+    k = report["k"] or None if report["kind"] in ("visdom", "inside") else None
     found = describe_check(check_views(views, masks, k=k, layout=scene.source.get("layout")), views.names)
     for name, share in report["coverage"].items():
         if share < _UNCOVERED:
@@ -202,6 +217,14 @@ def _finding(kind: str, what: str, views: list[str], evidence: float, todo: str)
     return {"kind": kind, "what": what, "views": views, "sure": "certain", "evidence": evidence, "todo": todo}
 
 
+def _inside_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
+    if "hull_volume" not in report:
+        return []
+    share = report["volume"] / report["hull_volume"]
+    text = f"{share:.1%} of the hull's volume, rounded to {report['radius']:g} of its radius"
+    return [("inside", text)]
+
+
 def _table(report: dict[str, Any]) -> str:
     size = " x ".join(f"{b - a:.4g}" for a, b in zip(*report["extent"], strict=True))
     rows = [
@@ -212,6 +235,7 @@ def _table(report: dict[str, Any]) -> str:
             "voxels",
             f"{report['voxels']} of {' x '.join(map(str, report['shape']))}, edge {report['voxel_size']:.4g}",
         ),
+        *_inside_rows(report),
         ("size", f"{size}, volume {report['volume']:.5g}, surface {report['surface_area']:.5g}"),
         (
             "pieces",
