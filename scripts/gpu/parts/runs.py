@@ -1,0 +1,137 @@
+"""`visdom-train` with the published schedule on the capture at 4 views. A run that does not end in its time is stopped,
+measured as it is, and goes on with the next call on the same machine, or where its checkpoint was carried along."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tarfile
+import time
+from pathlib import Path
+
+from bench import Bench, Case
+
+ORDER = {"3dgs-go+vd": 110, "ingp+vd": 150, "corgs-lite+vd": 150, "zipnerf-lite+vd": 200}
+"""Most seconds for each."""
+MOST_CARRIED = 14 << 20
+"""Bytes of the runs that go into OUT, so that another machine can go on."""
+
+
+def cases(bench: Bench) -> list[Case]:
+    limits = ORDER if bench.on_cuda else dict.fromkeys(ORDER, 120)
+    found = []
+    for name, limit in limits.items():
+        needs = () if name.startswith(("ingp", "zipnerf")) else ("gsplat",)
+        found.append(Case(name, _run(name, limit), limit + 5, needs))
+    return bench.choose(found)
+
+
+def _run(name: str, limit: float):
+    def run(bench: Bench) -> dict:
+        began = time.monotonic()
+        # Measuring what was stopped takes time, too.
+        until = min(limit, bench.settings["seconds"]) - (25 if bench.on_cuda else 40)
+        folder = bench.work / "runs" / name
+        _unpack(bench)
+        command = [
+            f"method:{name}",
+            "--views",
+            "4",
+            "--device",
+            str(bench.device),
+            "--out",
+            str(folder),
+            "--quiet",
+        ]
+        command += ["--budget", "quick" if bench.tiny else "full", "--checkpoint-seconds", "25"]
+        if bench.scene_path is not None:
+            command += ["--data", str(bench.scene_path)]
+        if bench.tiny:
+            command += ["--downscale", "5", "--method.steps", "6"]
+        _call("train", command, until)
+        record = json.loads((folder / "run.json").read_text())
+        if record["status"] != "finished":
+            _call(
+                "evaluate",
+                [str(folder), "--device", str(bench.device), "--quiet"],
+                limit - (time.monotonic() - began),
+            )
+            record = json.loads((folder / "run.json").read_text())
+        _pack(bench)
+        last = _last_line(folder / "log.jsonl")
+        steps, total = last.get("step", 0), record["config"]["steps"]
+        test = record.get("metrics", {}).get("test", {})
+        spent = last.get("train_s", 0)
+        return {
+            "status of the run": record["status"],
+            "steps": steps,
+            "of": total,
+            "train s": spent,
+            "ms a step": 1000 * spent / max(steps, 1),
+            "whole schedule, min": spent / max(steps, 1) * total / 60,
+            "hull s": record.get("timing", {}).get("hull_s"),
+            "eval s": record.get("timing", {}).get("eval_s"),
+            "PSNR": test.get("psnr"),
+            "IoU": test.get("silhouette_iou"),
+            "outside": test.get("outside_hull_mass"),
+        }
+
+    return run
+
+
+def _call(command: str, words: list[str], seconds: float) -> int:
+    """Runs one of the commands; after so many seconds it is asked to stop, which keeps its state."""
+    process = subprocess.Popen([sys.executable, "-m", f"visdom_plugin.cli.{command}", *words])
+    try:
+        return process.wait(timeout=max(seconds, 5))
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGTERM)
+    try:
+        return process.wait(timeout=20)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def _last_line(log: Path) -> dict:
+    lines = log.read_text().splitlines() if log.exists() else []
+    return json.loads(lines[-1]) if lines else {}
+
+
+def _unpack(bench: Bench) -> None:
+    """Runs that an earlier call left in its OUT, unless they are here already."""
+    resume = bench.settings["resume"]
+    archive = None if resume is None else Path(resume) / "runs.tar"
+    if archive is None or not archive.is_file():
+        return
+    with tarfile.open(archive) as tar:
+        for member in tar.getmembers():
+            if not (bench.work / member.name).exists():
+                tar.extract(member, bench.work, filter="data")
+
+
+def _pack(bench: Bench) -> None:
+    """Records, logs and first pictures of all runs, and newest checkpoints as far as they fit, into OUT/runs.tar."""
+    files = []
+    for folder in sorted((bench.work / "runs").iterdir()):
+        small = [folder / "run.json", folder / "log.jsonl", folder / "renders" / "test_sheet.png"]
+        states = sorted((folder / "checkpoints").glob("step-*.json"))[-1:]
+        files += [small, [s.with_suffix(".safetensors") for s in states] + states]
+    archive, size = bench.out / "runs.tar", 0
+    part = archive.with_name(".runs.tar.part")
+    with tarfile.open(part, "w") as tar:
+        for group in sorted(files, key=_size):
+            if size + _size(group) > MOST_CARRIED:
+                continue
+            size += _size(group)
+            for file in group:
+                if file.exists():
+                    tar.add(file, file.relative_to(bench.work))
+    os.replace(part, archive)
+
+
+def _size(files: list[Path]) -> int:
+    return sum(f.stat().st_size for f in files if f.exists())
