@@ -47,6 +47,7 @@ class Bench:
         self.device = torch.device(settings["device"])
         self.scene_path = None if settings["scene"] is None else Path(settings["scene"])
         self.work, self.out = Path(settings["work"]), Path(settings["out"])
+        self._end = time.monotonic() + settings["seconds"]
         if self.on_cuda and not torch.cuda.is_available():
             raise RuntimeError("torch sees no CUDA device")
 
@@ -57,6 +58,10 @@ class Bench:
         if not self.on_cuda:
             return [c for c in chosen if not c.only_cuda]
         return [c if set(c.needs) <= set(compiled) else _left_out(c) for c in chosen]
+
+    def left(self) -> float:
+        """Seconds until this process is ended."""
+        return self._end - time.monotonic()
 
     def size(self, full: int, tiny: int) -> int:
         """A size for measuring, or for the dry run."""

@@ -1,7 +1,6 @@
-"""Runs the parts of the GPU check within a budget of seconds, so that a part that hangs or fails costs only itself.
+"""Runs the parts of the GPU check within a budget of seconds; what hangs or fails costs only itself.
 
-Parts, in order of worth: tests, parity, hooks, train, steps, runs. Every part is a file in `parts/`, every case of it
-a row of the page. Called by `scripts/gpu_check.sh`.
+Every part is a file in `parts/`, every case of it a row of the page. Called by `scripts/gpu_check.sh`.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ import machine
 import page
 
 HERE = Path(__file__).resolve().parent
+# In order of worth.
 PARTS = ("tests", "parity", "hooks", "train", "steps", "runs", "conformance")
 LIMITS = {
     "tests": 120,
@@ -48,6 +48,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--tiny", action="store_true", help="smallest sizes: shows that everything runs")
     parser.add_argument("--wheels", type=Path, help="folder of scripts/gpu_wheels.sh")
     parser.add_argument("--scene", type=Path, help="a capture; by default the one beside the wheels")
+    parser.add_argument("--downscale", type=float, default=2.0, help="of the capture's photographs")
     parser.add_argument("--gsplat-cache", type=Path, help="compiled CUDA code; by default beside the wheels")
     parser.add_argument(
         "--reference", type=Path, help="results.json of `--device cpu train`, to compare with"
@@ -79,8 +80,9 @@ class Check:
         if args.gsplat_cache is None and beside and (beside / "compiled").is_dir():
             self.cache = beside / "compiled"
         self.results: dict = {"parts": {}, "device": args.device, "tiny": args.tiny}
+        self.before: dict[str, dict] = {}
         if args.resume and (args.resume / "results.json").is_file():
-            self.results["parts"] = json.loads((args.resume / "results.json").read_text())["parts"]
+            self.before = json.loads((args.resume / "results.json").read_text())["parts"]
 
     def left(self) -> float:
         return self.args.seconds - RESERVE - (time.monotonic() - self.began)
@@ -90,9 +92,10 @@ class Check:
         self.results["seconds"] = round(time.monotonic() - self.began, 1)
         if hasattr(self, "compilation"):
             self.results["compiled"] = self.compilation.notes
+        merged = self.results | {"parts": merge(self.before, self.results["parts"])}
         for name, text in (
-            ("results.json", json.dumps(self.results, indent=1)),
-            ("page.md", page.render(self.results)),
+            ("results.json", json.dumps(merged, indent=1)),
+            ("page.md", page.render(merged)),
         ):
             part = self.out / f".{name}.part"
             part.write_text(text)
@@ -133,7 +136,7 @@ class Check:
         lines = self.work / f"{part}.jsonl"
         lines.unlink(missing_ok=True)
         for _ in range(12):
-            process = self._start(part, lines, found)
+            process = self._start(part, lines, found, end)
             why = self._watch(process, lines, found, end)
             self._settle(found, why)
             left = [n for n in found.get("names", []) if n not in found["cases"]]
@@ -145,7 +148,7 @@ class Check:
         if left:
             found["note"] = "out of time: " + ", ".join(left)
 
-    def _start(self, part: str, lines: Path, found: dict) -> subprocess.Popen:
+    def _start(self, part: str, lines: Path, found: dict, end: float) -> subprocess.Popen:
         args = self.args
         settings = {
             "device": args.device,
@@ -157,7 +160,8 @@ class Check:
             "resume": None if args.resume is None else str(args.resume.resolve()),
             "only": args.only,
             "done": list(found["cases"]),
-            "seconds": self.left(),
+            "seconds": end - time.monotonic(),
+            "downscale": args.downscale,
             "compiled": [p for p in machine.PACKAGES if self._wait(p)],
         }
         log = (self.work / f"{part}.log").open("a")
@@ -231,6 +235,15 @@ class Check:
         logs = [*self.work.glob("*.log"), *self.cache.glob("*.log")]
         text = [f"===== {log.name}\n{log.read_text(errors='replace')[-20_000:]}\n" for log in sorted(logs)]
         (self.out / "log.txt").write_text("".join(text))
+
+
+def merge(before: dict[str, dict], now: dict[str, dict]) -> dict[str, dict]:
+    """The results of two calls by part, case by case; the later one counts."""
+    merged = dict(before)
+    for part, found in now.items():
+        cases = before.get(part, {}).get("cases", {}) | found.get("cases", {})
+        merged[part] = {**found, "cases": cases}
+    return {part: merged[part] for part in (*PARTS, *merged) if part in merged}
 
 
 def main(argv: list[str] | None = None) -> int:

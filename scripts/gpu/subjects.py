@@ -31,7 +31,7 @@ def capture(bench):
     """The capture that was carried along, with 4 views; the built-in scene where there is none."""
     if bench.scene_path is None:
         return built_in(bench.size(200, 48))
-    return project.load(bench.scene_path, views=4, downscale=bench.size(1, 8))
+    return project.load(bench.scene_path, views=4, downscale=8 if bench.tiny else bench.settings["downscale"])
 
 
 def rays(scene, count: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""What the hooks cost on the device: medians of single calls, kernel launches and waits of the host in each call."""
+"""What the hooks cost on the device: medians of single calls, kernel launches and waits of the host in a call."""
 
 from __future__ import annotations
 

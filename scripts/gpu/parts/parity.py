@@ -1,5 +1,6 @@
 """Kernels, hooks and losses on the device against the CPU: relative error of values and of gradients (norm of the
-difference over the norm), each against a bound. A first training step of every method, and one after a checkpoint."""
+difference over the norm), each against a bound. A first training step of every method, and one after a
+checkpoint."""
 
 from __future__ import annotations
 

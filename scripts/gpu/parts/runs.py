@@ -1,10 +1,10 @@
-"""`visdom-train` with the published schedule on the capture at 4 views. A run that does not end in its time is stopped,
-measured as it is, and goes on with the next call on the same machine, or where its checkpoint was carried along."""
+"""`visdom-train` with the published schedule on the capture at 4 views. A run that does not end in its time is
+stopped, measured as it is, and goes on with the next call on the same machine, or where its checkpoint was carried
+along."""
 
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -16,55 +16,53 @@ from bench import Bench, Case
 
 ORDER = {"3dgs-go+vd": 110, "ingp+vd": 150, "corgs-lite+vd": 150, "zipnerf-lite+vd": 200}
 """Most seconds for each."""
+MEASURING = 25
+"""Seconds kept for the test views of a run that was stopped."""
 MOST_CARRIED = 14 << 20
 """Bytes of the runs that go into OUT, so that another machine can go on."""
 
 
 def cases(bench: Bench) -> list[Case]:
-    limits = ORDER if bench.on_cuda else dict.fromkeys(ORDER, 120)
     found = []
-    for name, limit in limits.items():
+    for name, limit in ORDER.items():
         needs = () if name.startswith(("ingp", "zipnerf")) else ("gsplat",)
-        found.append(Case(name, _run(name, limit), limit + 5, needs))
+        found.append(Case(name, _run(name, limit), limit, needs))
     return bench.choose(found)
 
 
 def _run(name: str, limit: float):
     def run(bench: Bench) -> dict:
-        began = time.monotonic()
-        # Measuring what was stopped takes time, too.
-        until = min(limit, bench.settings["seconds"]) - (25 if bench.on_cuda else 40)
-        folder = bench.work / "runs" / name
+        end = time.monotonic() + min(limit, bench.left()) - 3
         _unpack(bench)
+        folder = _folder(bench) / name
+        common = ["--device", str(bench.device), "--quiet"]
         command = [
             f"method:{name}",
             "--views",
             "4",
-            "--device",
-            str(bench.device),
             "--out",
             str(folder),
-            "--quiet",
+            "--checkpoint-seconds",
+            "60",
+            *common,
         ]
-        command += ["--budget", "quick" if bench.tiny else "full", "--checkpoint-seconds", "25"]
+        command += ["--budget", "quick" if bench.tiny else "full"]
         if bench.scene_path is not None:
-            command += ["--data", str(bench.scene_path)]
+            downscale = 8 if bench.tiny else bench.settings["downscale"]
+            command += ["--data", str(bench.scene_path), "--downscale", str(downscale)]
         if bench.tiny:
-            command += ["--downscale", "5", "--method.steps", "6"]
-        _call("train", command, until)
+            command += ["--method.steps", "6"]
+        # A stopped run is measured as it is, which takes a while, too.
+        _call("train", command, end - MEASURING - time.monotonic())
         record = json.loads((folder / "run.json").read_text())
         if record["status"] != "finished":
-            _call(
-                "evaluate",
-                [str(folder), "--device", str(bench.device), "--quiet"],
-                limit - (time.monotonic() - began),
-            )
+            _call("evaluate", [str(folder), *common], end - time.monotonic())
             record = json.loads((folder / "run.json").read_text())
         _pack(bench)
         last = _last_line(folder / "log.jsonl")
         steps, total = last.get("step", 0), record["config"]["steps"]
-        test = record.get("metrics", {}).get("test", {})
-        spent = last.get("train_s", 0)
+        test, timing = record.get("metrics", {}).get("test", {}), record.get("timing", {})
+        spent = timing.get("train_s", last.get("train_s", 0))
         return {
             "status of the run": record["status"],
             "steps": steps,
@@ -72,8 +70,8 @@ def _run(name: str, limit: float):
             "train s": spent,
             "ms a step": 1000 * spent / max(steps, 1),
             "whole schedule, min": spent / max(steps, 1) * total / 60,
-            "hull s": record.get("timing", {}).get("hull_s"),
-            "eval s": record.get("timing", {}).get("eval_s"),
+            "hull s": timing.get("hull_s"),
+            "eval s": timing.get("eval_s"),
             "PSNR": test.get("psnr"),
             "IoU": test.get("silhouette_iou"),
             "outside": test.get("outside_hull_mass"),
@@ -82,18 +80,29 @@ def _run(name: str, limit: float):
     return run
 
 
-def _call(command: str, words: list[str], seconds: float) -> int:
-    """Runs one of the commands; after so many seconds it is asked to stop, which keeps its state."""
-    process = subprocess.Popen([sys.executable, "-m", f"visdom_plugin.cli.{command}", *words])
+def _folder(bench: Bench) -> Path:
+    """Where the runs of this kind of call lie."""
+    return bench.work / "runs" / f"{bench.device}{'-tiny' if bench.tiny else ''}"
+
+
+def _call(command: str, words: list[str], seconds: float) -> None:
+    """Runs one of the commands; after so many seconds it is asked to stop, which keeps its state.
+
+    Raises:
+        RuntimeError: when it fails, with the end of what it said.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", f"visdom_plugin.cli.{command}", *words], stderr=subprocess.PIPE, text=True
+    )
     try:
-        return process.wait(timeout=max(seconds, 5))
+        said = process.communicate(timeout=max(seconds, 5))[1]
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGTERM)
-    try:
-        return process.wait(timeout=20)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        return process.wait()
+        said = process.communicate()[1]
+    print(said[-4000:], file=sys.stderr)
+    # 130 is a run that was stopped and has kept its state; -15 something without one.
+    if process.returncode not in (0, 130, -signal.SIGTERM):
+        raise RuntimeError(f"visdom-{command} ended with {process.returncode}: {said.strip()[-500:]}")
 
 
 def _last_line(log: Path) -> dict:
@@ -114,9 +123,9 @@ def _unpack(bench: Bench) -> None:
 
 
 def _pack(bench: Bench) -> None:
-    """Records, logs and first pictures of all runs, and newest checkpoints as far as they fit, into OUT/runs.tar."""
+    """Records, logs and pictures of all runs, and newest checkpoints as far as they fit, into OUT/runs.tar."""
     files = []
-    for folder in sorted((bench.work / "runs").iterdir()):
+    for folder in sorted(_folder(bench).iterdir()):
         small = [folder / "run.json", folder / "log.jsonl", folder / "renders" / "test_sheet.png"]
         states = sorted((folder / "checkpoints").glob("step-*.json"))[-1:]
         files += [small, [s.with_suffix(".safetensors") for s in states] + states]
@@ -130,7 +139,7 @@ def _pack(bench: Bench) -> None:
             for file in group:
                 if file.exists():
                     tar.add(file, file.relative_to(bench.work))
-    os.replace(part, archive)
+    part.replace(archive)
 
 
 def _size(files: list[Path]) -> int:

@@ -1,12 +1,11 @@
-"""Step times at the published sizes on the capture: wall time over steps without a wait between them, launches and
-waits in one step, the share of the hook, most memory, and what that makes of the whole schedule. Beside them a bare
-loop around gsplat and nerfacc themselves."""
+"""Step times at the published sizes on the capture: wall time over steps without a wait between them, launches
+and waits in one step, the share of the hook, most memory, and what that makes of the whole schedule. Beside them a
+bare loop around gsplat and nerfacc themselves."""
 
 from __future__ import annotations
 
 import time
 
-import project
 import subjects
 import torch
 from bench import Bench, Case

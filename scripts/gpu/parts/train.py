@@ -1,5 +1,5 @@
-"""300 steps of every method, bare and in the visible domain, at its small size on the built-in scene: mean PSNR of the
-test views beside the CPU's, and how long a step takes."""
+"""300 steps of every method, bare and in the visible domain, at its small size on the built-in scene: mean PSNR
+of the test views beside the CPU's, and how long a step takes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import time
 
 import project
 import subjects
-import torch
 from bench import Bench, Case, Disagrees
 
 ALLOWED_DB = 0.5
