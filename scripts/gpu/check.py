@@ -31,6 +31,7 @@ LIMITS = {
     "conformance": 240,
 }
 """Seconds a part may take; the whole budget goes before."""
+WAITING = ("train", "steps", "runs")
 RESERVE = 8
 """Seconds kept for the end: packing, and the last page."""
 
@@ -79,6 +80,7 @@ class Check:
         self.cache = args.gsplat_cache or self.work / "compiled"
         if args.gsplat_cache is None and beside and (beside / "compiled").is_dir():
             self.cache = beside / "compiled"
+        self.warming: subprocess.Popen | None = None
         self.results: dict = {"parts": {}, "device": args.device, "tiny": args.tiny}
         self.before: dict[str, dict] = {}
         if args.resume and (args.resume / "results.json").is_file():
@@ -111,6 +113,8 @@ class Check:
         self.results["machine"] = machine.describe(args.device, self.env)
         self.write()
         self.compilation = machine.Compilation(self.cache, args.device, self.env)
+        if args.device == "cuda":
+            self._warm_up()
         self.results["ready_s"] = round(time.monotonic() - self.began, 1)
         self.write()
 
@@ -125,6 +129,8 @@ class Check:
                 self.write()
         finally:
             self.compilation.stop()
+            if self.warming is not None:
+                self._kill(self.warming)
             self.keep()
             self.write()
 
@@ -132,11 +138,13 @@ class Check:
         """All cases of a part, in as many processes as it takes."""
         print(f"== {part}, {self.left():.0f} s left", flush=True)
         found = self.results["parts"][part] = {"cases": {}}
-        end = time.monotonic() + min(LIMITS[part], self.left())
+        limit = LIMITS[part] if self.args.device == "cuda" else 8 * LIMITS[part]
+        end = time.monotonic() + min(limit, self.left())
         lines = self.work / f"{part}.jsonl"
         lines.unlink(missing_ok=True)
+        self._wait_for_code(part, end)
         for _ in range(12):
-            process = self._start(part, lines, found, end)
+            process = self._spawn(part, lines, self._settings(found, end - time.monotonic()), part)
             why = self._watch(process, lines, found, end)
             self._settle(found, why)
             left = [n for n in found.get("names", []) if n not in found["cases"]]
@@ -148,11 +156,19 @@ class Check:
         if left:
             found["note"] = "out of time: " + ", ".join(left)
 
-    def _start(self, part: str, lines: Path, found: dict, end: float) -> subprocess.Popen:
+    def _warm_up(self) -> None:
+        """Compiles the CPU kernels, which parity needs, in the background: the dry run of parity."""
+        lines = self.work / "warm-up.jsonl"
+        lines.unlink(missing_ok=True)
+        settings = self._settings({"cases": {}}, 120) | {"device": "cpu", "tiny": True, "only": None}
+        self.warming = self._spawn("parity", lines, settings, "warm-up")
+
+    def _settings(self, found: dict, seconds: float) -> dict:
         args = self.args
-        settings = {
+        return {
             "device": args.device,
             "tiny": args.tiny,
+            "downscale": args.downscale,
             "scene": None if self.scene is None else str(Path(self.scene).resolve()),
             "reference": str(self.reference) if self.reference and self.reference.is_file() else None,
             "work": str(self.work),
@@ -160,19 +176,22 @@ class Check:
             "resume": None if args.resume is None else str(args.resume.resolve()),
             "only": args.only,
             "done": list(found["cases"]),
-            "seconds": end - time.monotonic(),
-            "downscale": args.downscale,
-            "compiled": [p for p in machine.PACKAGES if self._wait(p)],
+            "seconds": seconds,
+            "compiled": [p for p in machine.PACKAGES if self.compilation.ready(p)],
         }
-        log = (self.work / f"{part}.log").open("a")
+
+    def _spawn(self, part: str, lines: Path, settings: dict, name: str) -> subprocess.Popen:
+        log = (self.work / f"{name}.log").open("a")
         command = [sys.executable, str(HERE / "worker.py"), part, str(lines), json.dumps(settings)]
         return subprocess.Popen(
             command, env=self.env, stdout=log, stderr=log, start_new_session=True, cwd=machine.CHECKOUT
         )
 
-    def _wait(self, package: str) -> bool:
-        """Whether a package's CUDA code is there; parts do not wait for it, later ones may find it."""
-        return bool(self.compilation.ready(package))
+    def _wait_for_code(self, part: str, end: float) -> None:
+        """Parts whose cases mostly need compiled code wait for it, at most half of their time."""
+        until = time.monotonic() + (end - time.monotonic()) / 2
+        while part in WAITING and self.compilation.ready("gsplat") is None and time.monotonic() < until:
+            time.sleep(0.5)
 
     def _watch(self, process: subprocess.Popen, lines: Path, found: dict, end: float) -> str:
         """Reads results until the process ends or must be ended; returns why it ended."""
