@@ -46,15 +46,10 @@ def register_checkout(site: Path) -> bool:
     return True
 
 
-def environment(work: Path, site: Path) -> dict[str, str]:
+def environment(site: Path) -> dict[str, str]:
     """Environment variables of every part's process."""
     paths = [str(site), str(CHECKOUT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    return os.environ | {
-        "PYTHONPATH": os.pathsep.join(paths),
-        "PYTHONUNBUFFERED": "1",
-        "NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR", str(work / "numba")),
-        "TRITON_CACHE_DIR": os.environ.get("TRITON_CACHE_DIR", str(work / "triton")),
-    }
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONUNBUFFERED": "1"}
 
 
 class Compilation:

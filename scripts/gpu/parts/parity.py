@@ -315,12 +315,12 @@ STEP_PIECES = (
     "contract",
     "harmonics",
 )
-"""Cases of tests/nerf/test_rays_gpu.py, whose errors stand here as numbers."""
+"""Cases of tests/nerf/sampling/test_rays_gpu.py, whose errors stand here as numbers."""
 
 
 def _step_piece(name: str):
     def run(bench: Bench) -> dict:
-        from tests.nerf import test_rays_gpu as tests
+        from tests.nerf.sampling import test_rays_gpu as tests
 
         case = tests._cases()[name]
         here, there = (tests._evaluate(*case, device) for device in ("cpu", bench.device))

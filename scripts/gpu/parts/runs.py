@@ -16,6 +16,13 @@ from bench import Bench, Case
 
 ORDER = {"3dgs-go+vd": 110, "ingp+vd": 150, "corgs-lite+vd": 150, "zipnerf-lite+vd": 200}
 """Most seconds for each."""
+CALL = """
+import sys
+from importlib.metadata import entry_points
+found = next(iter(entry_points(group="console_scripts", name=sys.argv.pop(1))))
+sys.exit(found.load()())
+"""
+"""Runs one of the installed commands by its name."""
 MEASURING = 25
 """Seconds kept for the test views of a run that was stopped."""
 MOST_CARRIED = 14 << 20
@@ -53,10 +60,10 @@ def _run(name: str, limit: float):
         if bench.tiny:
             command += ["--method.steps", "6"]
         # A stopped run is measured as it is, which takes a while, too.
-        _call("train", command, end - MEASURING - time.monotonic())
+        _call("visdom-train", command, end - MEASURING - time.monotonic())
         record = json.loads((folder / "run.json").read_text())
         if record["status"] != "finished":
-            _call("evaluate", [str(folder), *common], end - time.monotonic())
+            _call("visdom-eval", [str(folder), *common], end - time.monotonic())
             record = json.loads((folder / "run.json").read_text())
         _pack(bench)
         last = _last_line(folder / "log.jsonl")
@@ -92,7 +99,7 @@ def _call(command: str, words: list[str], seconds: float) -> None:
         RuntimeError: when it fails, with the end of what it said.
     """
     process = subprocess.Popen(
-        [sys.executable, "-m", f"visdom_plugin.cli.{command}", *words], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", CALL, command, *words], stderr=subprocess.PIPE, text=True
     )
     try:
         said = process.communicate(timeout=max(seconds, 5))[1]
@@ -102,7 +109,7 @@ def _call(command: str, words: list[str], seconds: float) -> None:
     print(said[-4000:], file=sys.stderr)
     # 130 is a run that was stopped and has kept its state; -15 something without one.
     if process.returncode not in (0, 130, -signal.SIGTERM):
-        raise RuntimeError(f"visdom-{command} ended with {process.returncode}: {said.strip()[-500:]}")
+        raise RuntimeError(f"{command} ended with {process.returncode}: {said.strip()[-500:]}")
 
 
 def _last_line(log: Path) -> dict:

@@ -20,7 +20,7 @@ def cases(bench: Bench) -> list[Case]:
     )
     gpu = ["-m", "gpu"]
     found = [Case("all marked gpu", lambda b: run_pytest(b, "gpu", [*gpu, *files]), 100)]
-    grid = ["tests/nerf/test_hash_grid.py", "-k", "triton"]
+    grid = [str(next((CHECKOUT / "tests").rglob("test_hash_grid.py"))), "-k", "triton"]
     found.append(Case("Triton against torch", lambda b: run_pytest(b, "triton", grid), 60))
     return bench.choose(found)
 
