@@ -3,7 +3,7 @@
 #   scripts/gpu_wheels.sh FOLDER [SCENE]
 # Wheels for Python 3.12 on x86-64 Linux go into FOLDER/wheels, and the scene, a folder in the layout of
 # GaussianObject's prepared scenes (by default $VISDOM_SCENES/blowtorch), into FOLDER/scene: the photographs and masks
-# of its four training views and its test views. Compiled CUDA code may lie in FOLDER/compiled
+# of all its views, since lists count them. Compiled CUDA code may lie in FOLDER/compiled
 # (scripts/gpu/build_cuda.py makes it). The whole stays below 60 MB.
 set -euo pipefail
 folder=${1:?name the folder to fill}
@@ -24,7 +24,6 @@ if [ -d "$scene" ]; then
   mkdir -p "$folder/scene/images" "$folder/scene/masks"
   cp -r "$scene/sparse" "$scene/sparse_4.txt" "$scene/sparse_test.txt" "$folder/scene/"
   [ -e "$scene/SOURCE.md" ] && cp "$scene/SOURCE.md" "$folder/scene/"
-  # The lists hold positions in the order of the images' names; every image has to be there to count them.
   cp "$scene"/images/* "$folder/scene/images/"
   cp "$scene"/masks/* "$folder/scene/masks/"
 else

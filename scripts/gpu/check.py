@@ -33,6 +33,8 @@ LIMITS = {
 }
 """Seconds a part may take; the whole budget goes before."""
 WAITING = ("train", "steps", "runs")
+STARTING = 90.0
+"""Seconds a process may take to say which cases it has: torch is loaded for the first time, perhaps."""
 RESERVE = 8
 """Seconds kept for the end: packing, and the last page."""
 
@@ -196,7 +198,7 @@ class Check:
 
     def _watch(self, process: subprocess.Popen, lines: Path, found: dict, end: float) -> str:
         """Reads results until the process ends or must be ended; returns why it ended."""
-        seen, running, limit, since = 0, None, 60.0, time.monotonic()
+        seen, running, limit, since = 0, None, STARTING, time.monotonic()
         limits: dict[str, float] = {}
         known = len(found["cases"])
         while True:

@@ -129,7 +129,7 @@ def describe(device: str, env: dict[str, str]) -> dict[str, str]:
     )
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=90
+            [sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=120
         )
         found = json.loads(done.stdout.strip().splitlines()[-1])
     except (subprocess.TimeoutExpired, IndexError, ValueError):

@@ -70,18 +70,10 @@ def _show(value) -> str:
     return str(value).replace("|", "\\|")
 
 
-HEAD = """# On a GPU
-
-What `scripts/gpu_check.sh` saw, card by card, and what nobody has seen yet. This page is made from its results:
-
-    python scripts/gpu/page.py RESULTS.json [...] > docs/gpu.md
-
-"""
-
-
 def main() -> None:
     texts = [render(json.loads(Path(name).read_text())) for name in sys.argv[1:]]
-    print(HEAD + "\n".join(texts), end="")
+    frame = Path(__file__).with_name("page_frame.md").read_text()
+    print(frame.replace("{cards}", "\n".join(texts).strip() or "No card has been seen yet."), end="")
 
 
 if __name__ == "__main__":

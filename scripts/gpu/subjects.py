@@ -27,6 +27,7 @@ def hull_of_built_in(resolution: int, size: int = 100):
     return project.VisibleDomain(dilate_px=1, resolution=resolution).carve(*views.silhouettes())
 
 
+@cache
 def capture(bench):
     """The capture that was carried along, with 4 views; the built-in scene where there is none."""
     if bench.scene_path is None:
@@ -67,13 +68,24 @@ def camera(width: int, height: int):
     return project.Cameras.from_matrices(K, motion, width=width, height=height)
 
 
-def start(name: str, scene, device: torch.device, *, budget: str = "quick", **changes):
-    """A method set up on the training views: the method, a function from step to batch, its config and hull."""
+def start(bench, name: str, scene, device: torch.device, *, budget: str = "quick", **changes):
+    """A method set up on the training views: the method, a function from step to batch, and its config."""
     preset = project.find(name)
     config = replace(getattr(preset, budget), **changes)
-    method, hull, _ = project.build(preset, config, scene.train, device=device, seed=0)
+    if bench.tiny:
+        config = _shrink(config)
+    method, _, _ = project.build(preset, config, scene.train, device=device, seed=0)
     batches = project.choose_batches(method, project.DataManager(scene.train, 0, device=device))
-    return method, batches, config, hull
+    return method, batches, config
+
+
+def _shrink(config):
+    """The settings with a coarse hull and few Gaussians or rays, so that a dry run is over soon."""
+    small = {"initial_points": 500, "max_rays": 64, "rays": 64, "occupancy_resolution": 16}
+    changes = {name: value for name, value in small.items() if hasattr(config, name)}
+    if config.hull is not None:
+        changes["hull"] = replace(config.hull, resolution=32)
+    return replace(config, **changes)
 
 
 def step_once(method, batches, step: int) -> None:

@@ -356,7 +356,7 @@ def _first_step(name: str):
         scene, found = subjects.built_in(bench.size(100, 40)), []
         changes = {"steps": 20}
         for device in (torch.device("cpu"), bench.device):
-            method, batches, _, _ = subjects.start(name, scene, device, **changes)
+            method, batches, _ = subjects.start(bench, name, scene, device, **changes)
             losses = method.train_step(batches(0), 0)
             sum(losses.values()).backward()
             found.append({k: float(v.detach()) for k, v in losses.items()})
@@ -370,11 +370,11 @@ def _first_step(name: str):
 def _resumed(name: str):
     def run(bench: Bench) -> dict:
         scene = subjects.built_in(bench.size(100, 40))
-        method, batches, _, _ = subjects.start(name, scene, bench.device, steps=20)
+        method, batches, _ = subjects.start(bench, name, scene, bench.device, steps=20)
         for step in range(3):
             subjects.step_once(method, batches, step)
         state = {k: v.detach().cpu().clone() for k, v in method.state_dict().items()}
-        again, batches_again, _, _ = subjects.start(name, scene, bench.device, steps=20)
+        again, batches_again, _ = subjects.start(bench, name, scene, bench.device, steps=20)
         again.load_state_dict(state)
         losses = []
         for one, draw in ((method, batches), (again, batches_again)):

@@ -54,7 +54,7 @@ def _steps(name: str):
         scene = subjects.capture(bench)
         budget = "quick" if bench.tiny else "full"
         bench.reset_peak()
-        method, batches, config, _ = subjects.start(name, scene, bench.device, budget=budget)
+        method, batches, config = subjects.start(bench, name, scene, bench.device, budget=budget)
         warm_up, timed, clocked = (2, 2, 2) if bench.tiny else (60, 100, 20)
         at = 0
         for _ in range(warm_up):

@@ -27,7 +27,7 @@ def _train(name: str):
         scene = subjects.built_in(bench.size(200, 40))
         steps = bench.size(300, 4)
         bench.reset_peak()
-        method, batches, _, _ = subjects.start(name, scene, bench.device, steps=steps)
+        method, batches, _ = subjects.start(bench, name, scene, bench.device, steps=steps)
         spent = []
         for step in range(steps):
             bench.synchronise()
