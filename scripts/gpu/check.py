@@ -75,6 +75,8 @@ class Check:
         self.out, self.work = args.out.resolve(), args.work.resolve()
         for folder in (self.out, self.work):
             folder.mkdir(parents=True, exist_ok=True)
+        for log in self.work.glob("*.log"):
+            log.unlink()
         self.site = self.work / "site"
         wheels = args.wheels
         beside = None if wheels is None else wheels.resolve()

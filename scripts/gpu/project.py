@@ -29,7 +29,6 @@ _HOME = {
     "Grid": "visdom_plugin.hull.carving.votes",
     "initial_table": "visdom_plugin.nerf.encoding.hash_grid",
     "load": "datamodules",
-    "look_at_camera": "visdom_plugin.geometry.cameras",
     "make_scene": "datamodules.synthetic.scene",
     "march_occupied": "visdom_plugin.nerf.sampling.occupancy_grid:march",
     "mask_loss": "visdom_plugin.losses",

@@ -60,9 +60,9 @@ def gaussians(count: int, degree: int = 3, seed: int = 0):
 
 
 def camera(width: int, height: int):
-    """A camera three units from the origin."""
-    up = torch.tensor([0.0, -1.0, 0.0])
-    motion = project.look_at_camera(torch.tensor([0.3, -0.4, -3.0]), torch.zeros(3), up)
+    """A camera three units before the origin, looking at it."""
+    motion = torch.eye(4)
+    motion[:3, 3] = torch.tensor([0.1, -0.2, -3.0])
     focal = 1.1 * width
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return project.Cameras.from_matrices(K, motion, width=width, height=height)
@@ -90,5 +90,6 @@ def _shrink(config):
 
 def step_once(method, batches, step: int) -> None:
     """One training step."""
-    sum(method.train_step(batches(step), step).values()).backward()
-    method.optimise(step)
+    output = method.train_step(batches(step), step)
+    output.total.backward()
+    method.optimise(step, output)

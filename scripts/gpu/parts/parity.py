@@ -357,9 +357,9 @@ def _first_step(name: str):
         changes = {"steps": 20}
         for device in (torch.device("cpu"), bench.device):
             method, batches, _ = subjects.start(bench, name, scene, device, **changes)
-            losses = method.train_step(batches(0), 0)
-            sum(losses.values()).backward()
-            found.append({k: float(v.detach()) for k, v in losses.items()})
+            output = method.train_step(batches(0), 0)
+            output.total.backward()
+            found.append({k: float(v.detach()) for k, v in output.losses.items()})
         errors = {f"loss {k}": (abs(found[1][k] - v) / max(abs(v), 1e-6), 5e-3) for k, v in found[0].items()}
         worst = max(errors.values())
         return judge({"of": len(errors)}, value=worst)
@@ -380,7 +380,7 @@ def _resumed(name: str):
         for one, draw in ((method, batches), (again, batches_again)):
             for step in (3, 4):
                 subjects.step_once(one, draw, step)
-            losses.append(float(sum(one.train_step(draw(5), 5).values()).detach()))
+            losses.append(float(one.train_step(draw(5), 5).total.detach()))
         # Sums by atomic additions are not repeatable, so neither is the step after them.
         return judge({}, value=(abs(losses[1] - losses[0]) / abs(losses[0]), 1e-2))
 

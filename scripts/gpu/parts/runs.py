@@ -62,7 +62,7 @@ def _run(name: str, limit: float):
         # A stopped run is measured as it is, which takes a while, too.
         _call("visdom-train", command, end - MEASURING - time.monotonic())
         record = json.loads((folder / "run.json").read_text())
-        if record["status"] != "finished":
+        if record["status"] != "finished" and any((folder / "checkpoints").glob("step-*.json")):
             _call("visdom-eval", [str(folder), *common], end - time.monotonic())
             record = json.loads((folder / "run.json").read_text())
         _pack(bench)
