@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 class VisDomError(Exception):
     """A user's problem: what is wrong, where, the likely cause, what to do about it.
@@ -45,3 +47,9 @@ class CheckpointError(VisDomError):
 
 class PluginError(VisDomError):
     """A method or hook registered from outside cannot be used."""
+
+
+def list_some(names: Iterable[object], most: int = 5) -> str:
+    """Names with commas between, "a, b, c, ... (9 in all)" where there are more than `most`."""
+    words = [str(name) for name in names]
+    return ", ".join(words[:most]) + (f", ... ({len(words)} in all)" if len(words) > most else "")

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from datamodules.files.paths import inside, read_plain
-from visdom_plugin.errors import SceneError
+from visdom_plugin.errors import SceneError, list_some
 
 SUFFIXES = (".ply", ".obj", ".off", ".stl")
 _FAR = 0.25
@@ -41,7 +41,7 @@ def find_mesh(root: Path, frame: int | None = None) -> Path | None:
         ] or found
     if len(found) > 1:
         raise SceneError(
-            f"there are {len(found)} meshes of the true surface: {', '.join(p.name for p in found[:4])}",
+            f"there are {len(found)} meshes of the true surface: {list_some((p.name for p in found), 4)}",
             where=root,
             todo="keep one of them, or name it with --method.target",
         )

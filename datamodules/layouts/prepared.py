@@ -15,6 +15,7 @@ from pathlib import Path
 from datamodules.capture import Capture
 from datamodules.layouts import colmap
 from datamodules.request import Request
+from visdom_plugin.errors import list_some
 
 
 def recognise(root: Path) -> str | None:
@@ -22,7 +23,7 @@ def recognise(root: Path) -> str | None:
     found = sorted(path.name for path in root.glob("sparse_*.txt"))
     others = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "calibration.csv")
     if found and ((root / "sparse").is_dir() or not any((root / name).exists() for name in others)):
-        return f"index files {', '.join(found[:3])}"
+        return f"index files {list_some(found, 3)}"
     return None
 
 

@@ -14,12 +14,11 @@ from torch import Tensor
 from datamodules.capture import Capture
 from datamodules.files.paths import inside, printable, stem
 from datamodules.request import Request
-from visdom_plugin.errors import SceneError
+from visdom_plugin.errors import SceneError, list_some
 
 log = logging.getLogger(__name__)
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
-_SHOWN = 5
 
 
 def mask_names(photograph: str) -> tuple[str, ...]:
@@ -63,11 +62,11 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> d
     shift = _find_shift((name for names in photographs for name in names), there)
     if (missing or shift) and not request.allow_missing_masks:
         missing = missing or [i for i in range(len(photographs)) if i not in found]
-        hint = f"there are masks that no image has: {some(extra)}" if extra else None
+        hint = f"there are masks that no image has: {list_some(extra)}" if extra else None
         reason = f"the masks' numbers are shifted by {shift}" if shift else "masks named otherwise"
         looked = " or ".join(f"{folder}/{printable(stem(name))}.png" for name in photographs[missing[0]])
         raise SceneError(
-            f"{len(missing)} of the images have no mask: {some([stem(photographs[i][0]) for i in missing])}",
+            f"{len(missing)} of the images have no mask: {list_some([stem(photographs[i][0]) for i in missing])}",
             where=path,
             cause=f"{reason}; {hint}" if hint else None,
             todo=f"name each mask like its image, such as {looked}; or say what becomes of views without: "
@@ -77,7 +76,10 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> d
         log.warning("%s: the masks look shifted by %d against the photographs' numbers", path, shift)
     if extra:
         log.info(
-            "%s: %d masks belong to no registered image and are ignored: %s", path, len(extra), some(extra)
+            "%s: %d masks belong to no registered image and are ignored: %s",
+            path,
+            len(extra),
+            list_some(extra),
         )
     return {i: named[i] or found.get(i) for i in wanted}
 
@@ -95,11 +97,6 @@ def find_ignored(capture: Capture, wanted: Sequence[int], request: Request) -> d
                 found[i] = file
                 break
     return found
-
-
-def some(names: Sequence[str]) -> str:
-    """The first few of many names."""
-    return ", ".join(names[:_SHOWN]) + (f", ... ({len(names)} in all)" if len(names) > _SHOWN else "")
 
 
 def looks_inverted(mask: Tensor) -> bool:

@@ -15,7 +15,7 @@ from datamodules.capture import Pools
 from datamodules.files.paths import read_inside
 from datamodules.request import Request
 from datamodules.views.view_lists import is_integer, read_list
-from visdom_plugin.errors import SceneError
+from visdom_plugin.errors import SceneError, list_some
 
 log = logging.getLogger(__name__)
 
@@ -138,13 +138,12 @@ def _spread(
             todo=todo,
         )
     train = spread(pool, wanted)
-    shown = ", ".join(names[i] for i in train[:12]) + (", ..." if len(train) > 12 else "")
     log.info(
         "%s: no index file for %d views; they are spread evenly over the %d free ones: %s",
         root,
         wanted,
         len(pool),
-        shown,
+        list_some((names[i] for i in train), 12),
     )
     return train, f"training views spread evenly over {len(pool)}"
 
@@ -153,7 +152,7 @@ def _refuse_shared(train: list[int], tested: list[int], where: str, root: Path) 
     shared = sorted(set(train) & set(tested))
     if shared:
         raise SceneError(
-            f"training and test share views {', '.join(map(str, shared[:8]))}",
+            f"training and test share views {list_some(shared, 8)}",
             where=f"{root}: {where}",
             cause="a test on views that were trained on measures nothing",
             todo=f"take them out of {where.split(' and ')[1]}",

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from datamodules.synthetic.scene import SyntheticConfig, make_scene
 from visdom_plugin.conformance.report import require
+from visdom_plugin.errors import list_some
 from visdom_plugin.registry import Preset, Registry
 from visdom_plugin.scene import Scene
 from visdom_plugin.training.batches import DataManager
@@ -174,7 +175,7 @@ def difference(one: State, other: State) -> str:
     """The first tensors that differ in any bit, in words; empty where none does."""
     if one.keys() != other.keys():
         odd = sorted(one.keys() ^ other.keys())
-        return f"only one of the two has {', '.join(odd[:3])}"
+        return f"only one of the two has {list_some(odd, 3)}"
     lines = []
     for name, value in one.items():
         twin = other[name]

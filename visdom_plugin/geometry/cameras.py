@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from visdom_plugin.errors import SceneError
+from visdom_plugin.errors import SceneError, list_some
 
 
 class Rays(NamedTuple):
@@ -246,8 +246,7 @@ def _which(bad: Tensor) -> str:
     if bad.ndim == 0:
         return "the camera"
     indices = bad.flatten().nonzero().flatten().tolist()
-    shown = ", ".join(str(i) for i in indices[:6]) + (", ..." if len(indices) > 6 else "")
-    return f"camera {shown}" if len(indices) == 1 else f"cameras {shown}"
+    return f"camera{'' if len(indices) == 1 else 's'} {list_some(indices, 6)}"
 
 
 def project(cameras: Cameras, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,13 +6,13 @@ scale_0..2 (logarithms), rot_0..3 (w x y z).
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from visdom_plugin.errors import SceneError
+from visdom_plugin.atomic_files import write_bytes
+from visdom_plugin.errors import SceneError, list_some
 from visdom_plugin.splat.gaussians import Gaussians
 
 _TYPES = {
@@ -28,10 +28,9 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     """Writes a 3DGS point cloud; the file appears complete or not at all.
 
     Args:
-        path: file to write; its folder must exist.
+        path: file to write.
         gaussians: any device and dtype, in the frame the file shall have.
     """
-    path = Path(path)
     arrays = {k: v.detach().cpu().float().numpy() for k, v in gaussians.tensors().items()}
     n, sh = len(gaussians), arrays["sh"]
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh.shape[1] - 1))
@@ -41,16 +40,7 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     names = _names(rest.shape[1])
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            file.write("\n".join(header).encode("ascii"))
-            file.write(table.tobytes())
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_bytes(Path(path), "\n".join(header).encode("ascii") + table.tobytes())
 
 
 def read_ply(path: str | Path) -> Gaussians:
@@ -59,7 +49,8 @@ def read_ply(path: str | Path) -> Gaussians:
     Properties may come in any order and number type, and unknown ones are passed over; normals may be missing.
 
     Raises:
-        SceneError: for a file that is missing, truncated, of another format, or without the properties of 3DGS.
+        SceneError: for a file that is missing, truncated, of another format, without the properties of 3DGS, or
+            with places that are not finite.
     """
     path = Path(path)
     try:
@@ -79,11 +70,11 @@ def read_ply(path: str | Path) -> Gaussians:
     n_rest = sum(name.startswith("f_rest_") for name in dtype.names)
     missing = [name for name in _names(n_rest) if name not in dtype.names and name not in ("nx", "ny", "nz")]
     if missing or n_rest not in _REST_OF_DEGREE:
-        what = f"lacks {', '.join(missing[:6])}" if missing else f"has {n_rest} f_rest properties"
+        what = f"lacks {list_some(missing, 6)}" if missing else f"has {n_rest} f_rest properties"
         raise SceneError(
             f"the point cloud {what}",
             where=path,
-            cause="a plain point cloud, not one of Gaussians",
+            cause="a mesh or a plain point cloud, not one of Gaussians",
             todo="give the point_cloud.ply of a 3DGS export, with harmonics of degree 0 to 3",
         )
 
@@ -98,6 +89,14 @@ def read_ply(path: str | Path) -> Gaussians:
     rest = take("f_rest_", n_rest).reshape(count, 3, n_rest // 3).transpose(0, 2, 1)
     sh = np.concatenate([take("f_dc_", 3)[:, None], rest], 1)
     opacity = rows["opacity"].astype(np.float32)
+    lost = int((~np.isfinite(means)).any(1).sum())
+    if lost:
+        raise SceneError(
+            f"{lost} of the {count} Gaussians have no finite place",
+            where=path,
+            cause="a training that diverged, or a damaged file",
+            todo="export the file again",
+        )
     arrays = (means, take("scale_", 3), take("rot_", 4), opacity, sh)
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays))
 

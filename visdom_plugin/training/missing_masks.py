@@ -20,7 +20,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from visdom_plugin.errors import SceneError
+from visdom_plugin.errors import SceneError, list_some
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.scene import Scene, Views
 
@@ -53,20 +53,20 @@ def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> S
     if (missing or unmeasured) and way == "error":
         absent = [scene.train.names[i] for i in missing] + [scene.test.names[i] for i in unmeasured]
         raise SceneError(
-            f"{len(absent)} views have no mask: {_list(absent)}",
+            f"{len(absent)} views have no mask: {list_some(absent)}",
             where=scene.name,
             todo="make masks for them, or pass --data.missing-masks colour|hull",
         )
     if unmeasured:
         log.warning(
             "%d of %d test views have no mask: they are rendered, but not measured (%s)",
-            len(unmeasured), len(scene.test), _list([scene.test.names[i] for i in unmeasured]),
+            len(unmeasured), len(scene.test), list_some([scene.test.names[i] for i in unmeasured]),
         )  # fmt: skip
     if not missing:
         return scene
     if given < 2:
         raise SceneError(
-            f"{len(missing)} training views have no mask: {_list([scene.train.names[i] for i in missing])}",
+            f"{len(missing)} training views have no mask: {list_some([scene.train.names[i] for i in missing])}",
             where=scene.name,
             cause=f"and only {given} training views have one: a hull needs two",
             todo="make masks for them",
@@ -88,10 +88,6 @@ def outline_views(hull, views: Views, indices: Sequence[int]) -> dict[int, Tenso
 
 def _missing(views: Views) -> list[int]:
     return [i for i in range(len(views)) if views.mask_origin(i) == "missing"]
-
-
-def _list(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 def _filled(views: Views, outlines: dict[int, Tensor], way: Way) -> Views:

@@ -175,7 +175,7 @@ def test_what_cannot_be_rendered_is_said_before_anything_is(trained, capsys, mon
     for name in ("video", "video.gif", "folder/", "."):
         fails(["--out", name], "ends in .mp4")
     record = json.loads((trained / "run.json").read_text())
-    for changed, says in ((empty, "the run has no test views"), (mixed, "differ in size")):
+    for changed, says in ((empty, "there are no test views"), (mixed, "differ in size")):
         monkeypatch.setattr(datamodules, "load", lambda *a, scene=changed, **k: scene)
         record["data"]["hashes"]["test_views"] = hash_views(changed.test)
         (trained / "run.json").write_text(json.dumps(record))

@@ -14,7 +14,7 @@ import tyro
 
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
-from visdom_plugin.errors import ConfigError, SceneError
+from visdom_plugin.errors import ConfigError, SceneError, list_some
 
 if TYPE_CHECKING:
     from visdom_plugin.hull.checks.check import Check
@@ -199,10 +199,10 @@ def _table(report: dict[str, Any]) -> None:
         for title in ("", "sure", "views", "what, and what to do"):
             table.add_column(title)
         for sure, f in rows:
-            views = f["views"]
-            shown = ", ".join(views[:3]) + (f" and {len(views) - 3} more" if len(views) > 3 else "")
             text = f"{escape(f['what'])}\n[italic]{escape(f['todo'])}[/italic]"
-            table.add_row(f["kind"], f"[{colours[sure]}]{sure}[/]", escape(shown) or "all", text)
+            table.add_row(
+                f["kind"], f"[{colours[sure]}]{sure}[/]", escape(list_some(f["views"], 3)) or "all", text
+            )
         console.print(table)
     for line in summarise_fit(report):
         console.print(escape(line))

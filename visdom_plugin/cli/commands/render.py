@@ -1,25 +1,41 @@
-"""visdom-render: pictures or a video of a run along a camera path."""
+"""visdom-render: pictures or a video of a run, or of any 3DGS point cloud, along a camera path."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from visdom_plugin.cli import entry
+from visdom_plugin.cli.options import Device, SceneOptions, read_options, resolve_device
 from visdom_plugin.errors import ConfigError
 
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
-@dataclass(frozen=True)
-class Options:
-    """Renders a run from its last checkpoint along a camera path, on white."""
+    from visdom_plugin.geometry.cameras import Cameras
+    from visdom_plugin.hull.hull import Hull
+    from visdom_plugin.render import Render
+    from visdom_plugin.scene import Scene
+    from visdom_plugin.splat.gaussians import Gaussians
+    from visdom_plugin.training.protocols import Method
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(SceneOptions):
+    """Renders a run from its last checkpoint along a camera path, on white.
+
+    In place of a run it takes the point_cloud.ply of any 3DGS, whoever trained it, and draws it with the cameras
+    of the scene that --data names: visdom-render point_cloud.ply --data DIR --path train
+    """
 
     run: tyro.conf.Positional[Path]
-    """Run directory, as visdom-train names it."""
+    """Run directory, as visdom-train names it, or a .ply file of Gaussians."""
     path: Literal["orbit", "between", "train", "test"] = "orbit"
     """orbit: a circle round the object; between: from training view to training view; train, test: these views."""
     frames: int = 60
@@ -29,13 +45,17 @@ class Options:
     format: Literal["mp4", "png"] = "mp4"
     """A video, or a folder of numbered pictures."""
     out: Path | None = None
-    """File or folder to write; by default <run>/renders/<path>.mp4 or <run>/renders/<path>_frames/."""
+    """File or folder to write; by default <run>/renders/<path>.mp4 or <run>/renders/<path>_frames/, and for
+    NAME.ply NAME_<path>.mp4 or NAME_<path>_frames/ beside it."""
     data: Path | None = None
-    """Where the scene is now, if it has moved."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Folder of the scene. A run knows its own: say where it is if it has moved."""
+    device: Device = "auto"
     """Where to compute."""
-    quiet: bool = False
-    """Print nothing but errors."""
+
+    @property
+    def is_ply(self) -> bool:
+        """Whether a point cloud is to be drawn."""
+        return self.run.suffix.lower() == ".ply" and not self.run.is_dir()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -57,13 +77,10 @@ def _render(argv: Sequence[str]) -> None:
         )
 
     from visdom_plugin.cli.report import say
-    from visdom_plugin.cli.runs import open_run
     from visdom_plugin.figures.contact_sheet import to_bytes, write_png, write_video
     from visdom_plugin.training.evaluate import render_on_white
 
-    _, _, scene, method, hull, device, _ = open_run(
-        options.run, options.data, options.device, test=options.path == "test"
-    )
+    scene, method, hull, device = (open_point_cloud if options.is_ply else open_trained)(options)
     cameras = choose_cameras(options.path, options.frames, scene, hull)
     target = options.out or default_target(options)
     if options.format == "png":
@@ -89,9 +106,71 @@ def _render(argv: Sequence[str]) -> None:
         sys.stdout.write(f"{target}\n")
 
 
+Subject = tuple["Scene", "Method | PointCloud", "Hull | None", "torch.device"]
+"""What is drawn: the scene with the cameras, what renders, its hull, where."""
+
+
+def open_trained(options: Options) -> Subject:
+    """A run's state, with the scene it was trained on.
+
+    Raises:
+        ConfigError: an option says how to read a scene, which run.json says already.
+    """
+    from visdom_plugin.cli.runs import open_run
+
+    for field in fields(SceneOptions):
+        if field.name not in ("data", "quiet") and getattr(options, field.name) != field.default:
+            raise ConfigError(
+                "a run's scene is read as it was for its training",
+                where=f"--{field.name.replace('_', '-')}",
+                todo="leave it out; it goes with a .ply file",
+            )
+    _, _, scene, method, hull, device, _ = open_run(
+        options.run, options.data, options.device, test=options.path == "test"
+    )
+    return scene, method, hull, device
+
+
+def open_point_cloud(options: Options) -> Subject:
+    """Gaussians from a file, with the scene whose cameras look at them; masks it need not have.
+
+    Raises:
+        SceneError: the file is no point cloud of Gaussians, or the scene cannot be read.
+    """
+    import torch
+
+    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.scenes import open_scene
+    from visdom_plugin.splat.ply import read_ply
+
+    device = torch.device(resolve_device(options.device))
+    gaussians = read_ply(options.run).to(device)
+    reading = read_options(options) | {"missing_masks": "colour"}
+    scene = open_scene(options.data, **reading, fill=False, test=options.path == "test")
+    if not options.quiet:
+        whose = " (--data DIR names another scene)" if options.data is None else ""
+        say(f"{len(gaussians)} Gaussians seen by the cameras of {scene.name}{whose}")
+    return scene, PointCloud(gaussians), None, device
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Gaussians that render as a trained method does."""
+
+    gaussians: Gaussians
+
+    def render(self, camera: Cameras, background: Tensor) -> Render:
+        """Their picture; `splat.rasterise` has the details."""
+        from visdom_plugin.splat.rasterise import rasterise
+
+        return rasterise(self.gaussians, camera, background)
+
+
 def default_target(options: Options) -> Path:
     """Where a path's pictures go by default; not into renders/test, which is the evaluation's."""
     name = f"{options.path}.mp4" if options.format == "mp4" else f"{options.path}_frames"
+    if options.is_ply:
+        return options.run.with_name(f"{options.run.stem}_{name}")
     return options.run / "renders" / name
 
 
@@ -116,7 +195,7 @@ def clear_numbered(folder: Path, count: int, *, ours: bool) -> None:
         picture.unlink()
 
 
-def choose_cameras(path: str, frames: int, scene, hull):
+def choose_cameras(path: str, frames: int, scene: Scene, hull: Hull | None) -> Cameras:
     """(frames,) cameras of a path; the views' own for "train" and "test".
 
     Raises:
@@ -129,7 +208,7 @@ def choose_cameras(path: str, frames: int, scene, hull):
 
     if path in ("train", "test"):
         if not len(getattr(scene, path)):
-            raise ConfigError(f"the run has no {path} views", where=f"--path {path}", todo="--path orbit")
+            raise ConfigError(f"there are no {path} views", where=f"--path {path}", todo="--path orbit")
         return getattr(scene, path).cameras
     cameras = scene.train.cameras
     centre = look_at_point(cameras) if hull is None else torch.as_tensor(hull.centre)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
+from visdom_plugin.errors import list_some
+
 Sure = Literal["certain", "likely", "possible"]
 
 
@@ -36,5 +38,5 @@ class Name(list[str]):
         """ "a", "a and b", "a, b and c", "a, b, ... (9 in all)"."""
         names = [self[i] for i in views]
         if len(names) > most:
-            return ", ".join(names[:most]) + f", ... ({len(names)} in all)"
+            return list_some(names, most)
         return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from visdom_plugin.atomic_files import write_bytes
-from visdom_plugin.errors import ConfigError, SceneError
+from visdom_plugin.errors import ConfigError, SceneError, list_some
 from visdom_plugin.tables.protocol import Fact, facts_of_settings, refuse_mixture
 from visdom_plugin.tables.results import Job, Outcome
 from visdom_plugin.tables.run.job_files import beside
@@ -208,7 +208,7 @@ def _find_scenes(spec: TableSpec, column: Column, roots: dict[str, Path]) -> dic
             raise ConfigError(
                 f"scene {scene!r} is not below the data root {root}",
                 where=where,
-                todo=f"scenes there: {', '.join(there[:12]) or 'none'}",
+                todo=f"scenes there: {list_some(there, 12) or 'none'}",
             )
         found[scene] = path.resolve()
     return found

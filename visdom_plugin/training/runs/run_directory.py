@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from visdom_plugin.atomic_files import MARK, remove_parts, write_bytes, write_json
-from visdom_plugin.errors import CheckpointError
+from visdom_plugin.errors import CheckpointError, list_some
 from visdom_plugin.scene import Scene, Views
 from visdom_plugin.training.runs.checkpoints import list_steps
 from visdom_plugin.training.runs.config_io import as_plain, differences
@@ -122,7 +122,7 @@ class RunDir:
         foreign = run._foreign()
         if foreign:
             raise CheckpointError(
-                f"the directory holds files that are not a run's: {', '.join(foreign[:3])}",
+                f"the directory holds files that are not a run's: {list_some(foreign, 3)}",
                 where=run.path,
                 todo="choose an empty directory with --out; nothing was changed",
             )
