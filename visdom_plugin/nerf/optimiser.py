@@ -56,9 +56,8 @@ class FieldOptimiser:
             prefix = f"adam.{name}."
             moments = {k[len(prefix) :]: v.clone() for k, v in state.items() if k.startswith(prefix)}
             if moments:
-                self.adam.state[parameter] = {
-                    k: v if k == "step" else v.to(parameter.device) for k, v in moments.items()
-                }
+                # The count of steps, too: fused Adam reads it on the device.
+                self.adam.state[parameter] = {k: v.to(parameter.device) for k, v in moments.items()}
 
 
 def warm_up_and_steps(

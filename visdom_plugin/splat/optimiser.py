@@ -93,4 +93,5 @@ class GaussianOptimiser:
             prefix = f"adam.{name}."
             moments = {k[len(prefix) :]: v.clone() for k, v in state.items() if k.startswith(prefix)}
             if moments:
-                self.adam.state[new] = {k: v if k == "step" else v.to(new.device) for k, v in moments.items()}
+                # The count of steps, too: fused Adam reads it on the device.
+                self.adam.state[new] = {k: v.to(new.device) for k, v in moments.items()}
