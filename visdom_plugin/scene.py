@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
@@ -37,6 +38,9 @@ class Views:
     such a pixel takes part in no loss and no metric, and cannot carve."""
     mask_origins: Sequence[MaskOrigin] = ()
     """Where each mask comes from; empty when all are given."""
+    origin: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
+    """(3,) float64: where the origin of the cameras' frame lies in the capture's own, which has the same axes.
+    What is written for others is in the capture's own frame."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -63,7 +67,14 @@ class Views:
             chosen(self.mono_depths),
             chosen(self.ignore),
             chosen(self.mask_origins),
+            self.origin,
         )
+
+    def relative_to(self, origin: Tensor) -> Views:
+        """The same views in the frame that has its origin at `origin` (3,) float64; themselves for zero."""
+        if not origin.any():
+            return self
+        return replace(self, cameras=self.cameras.relative_to(origin), origin=self.origin + origin)
 
     def silhouettes(self) -> tuple[Cameras, Sequence[Tensor]]:
         """What may carve: the cameras and masks of the views whose mask was given.

@@ -138,6 +138,12 @@ class Cameras:
         translation = -(rotation @ self.world_from_camera[..., :3, 3:])
         return torch.cat([torch.cat([rotation, translation], -1), self.world_from_camera[..., 3:, :]], -2)
 
+    def relative_to(self, origin: Tensor) -> Cameras:
+        """The same cameras in the frame that has its origin at `origin` (3,) float64, with the same axes."""
+        motion = self.world_from_camera.clone()
+        motion[..., :3, 3] = (self.centres.double() - origin.to(motion.device)).to(motion)
+        return Cameras(self.intrinsics, motion, self.width, self.height)
+
     def resized(self, width, height) -> Cameras:
         """Cameras whose images were resampled to another size, each axis by its own ratio."""
         width, height = _sizes(self.shape, self.width.device, width=width, height=height)

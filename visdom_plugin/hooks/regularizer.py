@@ -15,6 +15,7 @@ from torch import Generator, Tensor
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.camera_paths import interpolate
 from visdom_plugin.geometry.cameras import Cameras, project, require_batch
+from visdom_plugin.geometry.local_frame import is_near
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.point_colours import check_images, colour_points
@@ -163,12 +164,17 @@ class VisDomGaussianRegularizer:
         self._warned = False
 
     def initial_points(self, n: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Points to start from: xyz (n, 3) float32 world frame and rgb (n, 3) float32 in [0, 1], on the device
-        of the training cameras."""
+        """Points to start from: xyz (n, 3) world frame and rgb (n, 3) in [0, 1], on the device of the cameras.
+
+        Both are float32; only where the hull is so far from the origin that float32 would move points, xyz is
+        float64. Trainers in float32 want `hull.relative_to(origin)` and `cameras.relative_to(origin)` there.
+        """
         draw = self.hull.sample_points if self.config.points == "surface" else self.hull.sample_inside
-        xyz = draw(n, generator).float()
+        xyz = draw(n, generator)
+        if is_near(self.hull.extent, float(np.ptp(self.hull.extent, axis=0).max())):
+            xyz = xyz.float()
         if self.images is None:
-            rgb = torch.full_like(xyz, 0.5)
+            rgb = torch.full(xyz.shape, 0.5)
         else:
             rgb = colour_points(self.hull, xyz, self.cameras, self.images)
         return xyz.to(self._device), rgb.to(self._device)

@@ -16,6 +16,7 @@ from torch import Generator, Tensor
 
 from visdom_plugin.atomic_files import appearing, write_bytes
 from visdom_plugin.errors import CheckpointError
+from visdom_plugin.geometry.mesh_files import mesh_ply
 from visdom_plugin.hull.foreign import check_bounds, check_grid
 from visdom_plugin.hull.grid.mesh import mesh_grid
 
@@ -82,6 +83,11 @@ class Hull:
         return same and np.array_equal(self.occupancy, other.occupancy)
 
     __hash__ = None  # type: ignore[assignment]
+
+    def relative_to(self, origin) -> Hull:
+        """The same hull in the frame that has its origin at `origin` (3,), with the same axes; itself for zero."""
+        origin = np.asarray(origin, np.float64)
+        return Hull(self.occupancy, self.bounds - origin, self.summary) if origin.any() else self
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -306,16 +312,8 @@ class Hull:
             ) from error
 
     def write_ply(self, path: str | Path) -> None:
-        """Writes the mesh as binary PLY (float32 vertices, world frame); the file appears whole or not at all."""
-        vertices, faces = self.to_mesh()
-        records = np.empty(len(faces), np.dtype([("count", "u1"), ("index", "<i4", 3)]))
-        records["count"], records["index"] = 3, faces
-        header = (
-            "ply\nformat binary_little_endian 1.0\n"
-            f"element vertex {len(vertices)}\n" + "".join(f"property float {a}\n" for a in "xyz")
-            + f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-        )  # fmt: skip
-        write_bytes(Path(path), header.encode() + vertices.astype("<f4").tobytes() + records.tobytes())
+        """Writes the mesh as binary PLY, world frame; the file appears whole or not at all."""
+        write_bytes(Path(path), mesh_ply(*self.to_mesh()))
 
 
 def _freeze(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from visdom_plugin.errors import CheckpointError, ConfigError, PluginError
 from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.geometry.local_frame import require_near
 from visdom_plugin.hooks.regularizer import VisDomGaussianRegularizer
 from visdom_plugin.render import Render
 from visdom_plugin.seeding import generator
@@ -49,6 +50,9 @@ class VisDomStrategy:
         render: draws opacity, `render(params, camera)` -> what `VisDomGaussianRegularizer.loss` takes; the default
             is gsplat's own rasteriser, on CUDA.
         seed: of the loss's views, which depend on nothing else but the step.
+
+    Raises:
+        ConfigError: for an unknown `outside`, or a hull too far from the origin for gsplat, which is in float32.
     """
 
     def __init__(
@@ -61,6 +65,8 @@ class VisDomStrategy:
     ):
         if outside not in ("auto", "remove", "fade", "keep"):
             raise ConfigError(f"outside is {outside!r}", todo='use "auto", "remove", "fade" or "keep"')
+        extent = hook.hull.extent
+        require_near(extent, float(np.ptp(extent, axis=0).max()), "VisDomStrategy")
         self.hook, self.outside, self.render, self.seed = hook, outside, render or draw_opacity, seed
         self.ended = 0
         """Gaussians removed or faded so far; one that MCMCStrategy revives outside counts again."""

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.errors import ConfigError, PluginError
+from visdom_plugin.geometry.local_frame import require_near
 from visdom_plugin.hooks.protocols import SamplerHook
 from visdom_plugin.hull.hull import Hull
 
@@ -59,7 +60,8 @@ def confine(estimator: Any, hull: Hull, *, margin: float = 0.0) -> int:
         How many cells stay open.
 
     Raises:
-        ConfigError: when no cell stays open; the estimator is left as it was.
+        ConfigError: when no cell stays open, or the boxes lie so far from the origin that nerfacc's float32 cannot
+            hold them; the estimator is left as it was.
         PluginError: for nerfacc before 0.5.3, whose updates look at closed cells, too.
     """
     package = type(estimator).__module__.partition(".")[0]
@@ -68,6 +70,8 @@ def confine(estimator: Any, hull: Hull, *, margin: float = 0.0) -> int:
             f"the updates of nerfacc {version(package)} open closed cells again",
             todo="pip install 'nerfacc>=0.5.3', or bound rays alone, with ray_limits",
         )
+    innermost = estimator.aabbs[0].reshape(2, 3).cpu().numpy()
+    require_near(innermost, float(np.ptp(innermost, axis=0).max()), f"aabbs {innermost.tolist()}")
     total = np.zeros(np.add(hull.shape, 1), np.int64)
     total[1:, 1:, 1:] = hull.occupancy.cumsum(0, dtype=np.int64).cumsum(1).cumsum(2)
     reached = []

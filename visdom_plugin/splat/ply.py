@@ -1,7 +1,7 @@
-"""Gaussians as the `point_cloud.ply` of 3DGS: binary little endian, float32, before activation.
+"""Gaussians as the `point_cloud.ply` of 3DGS: binary little endian, before activation.
 
 Properties: x y z, nx ny nz (zero), f_dc_0..2, f_rest_* (all of red, then green, then blue), opacity (logit),
-scale_0..2 (logarithms), rot_0..3 (w x y z).
+scale_0..2 (logarithms), rot_0..3 (w x y z). All are float, but x y z far from their frame's origin are double.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from visdom_plugin.atomic_files import write_bytes
 from visdom_plugin.errors import SceneError, list_some
@@ -24,28 +25,34 @@ _REST_OF_DEGREE = (0, 9, 24, 45)
 _MAX_HEADER_BYTES = 1 << 16
 
 
-def write_ply(path: str | Path, gaussians: Gaussians) -> None:
+def write_ply(path: str | Path, gaussians: Gaussians, origin: Tensor | None = None) -> None:
     """Writes a 3DGS point cloud; the file appears complete or not at all.
 
     Args:
         path: file to write.
-        gaussians: any device and dtype, in the frame the file shall have.
+        gaussians: any device and dtype.
+        origin: (3,) float64 of their frame, in the frame the file shall have; None for the same frame.
     """
     arrays = {k: v.detach().cpu().float().numpy() for k, v in gaussians.tensors().items()}
     n, sh = len(gaussians), arrays["sh"]
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh.shape[1] - 1))
-    columns = [arrays["means"], np.zeros((n, 3)), sh[:, 0], rest, arrays["opacity_logits"][:, None]]
+    columns = [np.zeros((n, 3)), sh[:, 0], rest, arrays["opacity_logits"][:, None]]
     columns += [arrays["log_scales"], arrays["quaternions"]]
-    table = np.concatenate(columns, 1).astype("<f4")
-    names = _names(rest.shape[1])
+    far = origin is not None and bool(origin.any())
+    names, places = _names(rest.shape[1]), "double" if far else "float"
+    table = np.empty(n, [("xyz", _TYPES[places], 3), ("rest", "<f4", len(names) - 3)])
+    table["xyz"] = gaussians.means.detach().cpu().double() + origin if far else arrays["means"]
+    table["rest"] = np.concatenate(columns, 1)
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
-    header += [f"property float {name}" for name in names] + ["end_header", ""]
+    header += [f"property {places} {name}" for name in names[:3]]
+    header += [f"property float {name}" for name in names[3:]] + ["end_header", ""]
     write_bytes(Path(path), "\n".join(header).encode("ascii") + table.tobytes())
 
 
-def read_ply(path: str | Path) -> Gaussians:
+def read_ply(path: str | Path, origin: Tensor | None = None) -> Gaussians:
     """Reads a 3DGS point cloud, float32 on the CPU.
 
+    With `origin` (3,) float64 the means are relative to it: far from the file's own, float32 cannot hold them.
     Properties may come in any order and number type, and unknown ones are passed over; normals may be missing.
 
     Raises:
@@ -85,7 +92,8 @@ def read_ply(path: str | Path) -> Gaussians:
             values[:, i] = rows[name]
         return values
 
-    means = np.stack([rows[name] for name in "xyz"], -1).astype(np.float32)
+    places = np.stack([rows[name].astype(np.float64) for name in "xyz"], -1)
+    means = (places - (0 if origin is None else origin.numpy())).astype(np.float32)
     rest = take("f_rest_", n_rest).reshape(count, 3, n_rest // 3).transpose(0, 2, 1)
     sh = np.concatenate([take("f_dc_", 3)[:, None], rest], 1)
     opacity = rows["opacity"].astype(np.float32)

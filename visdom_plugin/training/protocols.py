@@ -99,6 +99,9 @@ class Method(Protocol):
     ) -> None:
         """Builds parameters and optimisers on `device` from the training views.
 
+        Views, hooks, hull, batches and cameras are in one frame, whose coordinates float32 can hold. Where the
+        capture's own is too far from its origin for that, `views.origin` tells where the frame lies in it.
+
         `hull` is the one the config asked for, or None when the config has no `hull` field. `hooks` is empty
         for the variants without VisDom, and when the hook is switched off.
         """
@@ -140,5 +143,8 @@ class Method(Protocol):
         ...
 
     def export(self, folder: Path) -> list[Path]:
-        """Writes the reconstruction into the folder, in standard formats and the input frame; returns files."""
+        """Writes the reconstruction into the folder, in standard formats; returns files.
+
+        They are in the capture's own frame, `views.origin` away from the method's.
+        """
         ...

@@ -17,6 +17,7 @@ from visdom_plugin.atomic_files import appearing, finite
 from visdom_plugin.errors import CheckpointError, ConfigError, EmptyHullError, PluginError, SceneError
 from visdom_plugin.scene import Scene, Views
 from visdom_plugin.training.evaluate import carve_reference, evaluate
+from visdom_plugin.training.local_method import LocalMethod, move_near
 from visdom_plugin.training.protocols import Method
 from visdom_plugin.training.runs import checkpoints
 from visdom_plugin.training.runs.config_io import as_plain, differences
@@ -115,7 +116,7 @@ def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoi
         # Of the run that carved it, not of one that goes on with it.
         hull_s = run.record.get("timing", {}).get("hull_s", hull_s)
         run.update(timing={"hull_s": hull_s})
-    batches = data_manager(scene.train, seed, device)
+    batches = data_manager(move_near(scene.train), seed, device)
     trainer = Trainer(
         method,
         choose_batches(method, batches),
@@ -169,6 +170,9 @@ def build(
 ) -> tuple[Method, Hull | None, float]:
     """The method set up on the training views, its hull (None without one), and the seconds that took.
 
+    Method and hooks work in the frame of `move_near(views)`; the hull returned, and the cameras that the method is
+    asked to render, are in the views' own.
+
     Args:
         saved: the folder in which the run keeps its hull, if it has one already: it is read, not carved again.
     """
@@ -177,9 +181,12 @@ def build(
         hull = read_hull(saved / HULL) if saved is not None else None
         hull = config.hull.carve(*views.silhouettes()) if hull is None else hull
     hull_s = time.monotonic() - began
-    hooks = make_hooks(config, hull, views)
-    method = preset.load()(config)
-    method.setup(views, hooks, hull=hull, device=device, seed=seed)
+    near = move_near(views)
+    near_hull = None if hull is None else hull.relative_to(near.origin)
+    method: Method = preset.load()(config)
+    method.setup(near, make_hooks(config, near_hull, near), hull=near_hull, device=device, seed=seed)
+    if near is not views:
+        method = LocalMethod(method, near.origin)
     return method, hull, hull_s
 
 

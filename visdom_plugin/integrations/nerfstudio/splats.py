@@ -56,7 +56,7 @@ class SplatfactoVd(SplatfactoModel):
                 self.hook, self.frame = self.config.vd.build(hull, known.views), known.frame
             xyz, rgb = self.hook.initial_points(self.config.initial_points, torch.Generator().manual_seed(0))
             # Nerfstudio's colours of points go to 255.
-            self.seed_points = self.frame.points_to_model(xyz), 255 * rgb
+            self.seed_points = self.frame.points_to_model(xyz).float(), 255 * rgb
         super().populate_modules()
         # Training shows random colours; nerfstudio would draw pictures and metrics on a dark grey.
         if self.config.background_color == "random":

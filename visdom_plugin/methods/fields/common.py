@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras, pixel_radius, rays_of
+from visdom_plugin.geometry.mesh_files import mesh_ply
 from visdom_plugin.hooks.protocols import SamplerHook
 from visdom_plugin.losses import composite, mask_loss
 from visdom_plugin.nerf.frame import Frame
@@ -211,13 +212,13 @@ def mesh_density(
     return frame.to_world(torch.from_numpy(local)).numpy(), faces.astype(np.int64), rgb
 
 
-def export_mesh(path: Path, mesh: tuple[np.ndarray, np.ndarray, np.ndarray] | None) -> list[Path]:
-    """Writes the mesh as PLY with vertex colours; nothing, with a warning, where there is none."""
+def export_mesh(
+    path: Path, mesh: tuple[np.ndarray, np.ndarray, np.ndarray] | None, origin: Tensor
+) -> list[Path]:
+    """Writes the mesh, moved by `origin` (3,), as PLY with vertex colours; warns where there is none."""
     if mesh is None:
         log.warning("no mesh is exported: nowhere is the field half opaque")
         return []
-    import trimesh
-
     vertices, faces, rgb = mesh
-    trimesh.Trimesh(vertices, faces, vertex_colors=rgb, process=False).export(path)
+    path.write_bytes(mesh_ply(vertices + origin.numpy(), faces, rgb))
     return [path]

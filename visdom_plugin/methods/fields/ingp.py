@@ -57,7 +57,7 @@ class Ingp:
         self, views: Views, hooks: Sequence[SamplerHook], *, hull, device: torch.device, seed: int
     ) -> None:
         c = self.config
-        self.device, self.seed, self.hooks = device, seed, list(hooks)
+        self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
         self.frame = frame_of(views.cameras)
         draw = generator(seed, "field")
         self.table = torch.nn.Parameter(initial_table(c.grid, draw).to(device))
@@ -152,7 +152,7 @@ class Ingp:
             return torch.where(there, self._density(points), 0)
 
         mesh = mesh_density(density_of, self._colour, self.frame, self.config.half_side)
-        return export_mesh(Path(folder) / "mesh.ply", mesh)
+        return export_mesh(Path(folder) / "mesh.ply", mesh, self.origin)
 
     def _hooks_at_inference(self) -> list[SamplerHook]:
         return self.hooks if self.config.vd.hull_at_inference else []

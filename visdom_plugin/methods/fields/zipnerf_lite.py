@@ -120,7 +120,7 @@ class ZipNerfLite:
         self, views: Views, hooks: Sequence[SamplerHook], *, hull, device: torch.device, seed: int
     ) -> None:
         c = self.config
-        self.device, self.seed, self.hooks = device, seed, list(hooks)
+        self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
         self.frame = frame_of(views.cameras)
         draw = generator(seed, "field")
         self.model = nn.ModuleDict(
@@ -203,7 +203,7 @@ class ZipNerfLite:
 
     def export(self, folder: Path) -> list[Path]:
         mesh = mesh_density(self._density, self._colour, self.frame, half_side=1.0)
-        return export_mesh(Path(folder) / "mesh.ply", mesh)
+        return export_mesh(Path(folder) / "mesh.ply", mesh, self.origin)
 
     def _bound(self, origins: Tensor, directions: Tensor, hooks: Sequence[SamplerHook]) -> LocalRays:
         near = torch.full(origins.shape[:-1], self.config.near, device=origins.device)

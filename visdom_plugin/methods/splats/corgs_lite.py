@@ -52,7 +52,7 @@ class CorgsLite:
                 f"corgs-lite compares its two sets between training cameras, and there is {len(views)}",
                 todo="give --views 2 or more",
             )
-        self.device, self.seed, self.hooks = device, seed, list(hooks)
+        self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
         self.cameras, self.look_at = views.cameras, look_at_point(views.cameras)
         self.ellipse = fit_ellipse(views.cameras)
         load_kernels(device)
@@ -136,7 +136,7 @@ class CorgsLite:
 
     def export(self, folder: Path) -> list[Path]:
         path = Path(folder) / "point_cloud.ply"
-        write_ply(path, self.sets[0].gaussians())
+        write_ply(path, self.sets[0].gaussians(), self.origin)
         return [path]
 
 

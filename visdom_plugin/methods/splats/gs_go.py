@@ -39,7 +39,7 @@ class GsGo:
     def setup(
         self, views: Views, hooks: Sequence[GaussianHook], *, hull, device: torch.device, seed: int
     ) -> None:
-        c = self.config
+        c, self.origin = self.config, views.origin
         self.device, self.seed, self.hooks = device, seed, list(hooks)
         load_kernels(device)
         xyz, rgb = draw_points(self.hooks, hull, views, c.initial_points, generator(seed, "initial_points"))
@@ -89,5 +89,5 @@ class GsGo:
 
     def export(self, folder: Path) -> list[Path]:
         path = Path(folder) / "point_cloud.ply"
-        write_ply(path, self.splats.gaussians())
+        write_ply(path, self.splats.gaussians(), self.origin)
         return [path]
