@@ -101,7 +101,7 @@ def test_the_regularizer_is_the_same_in_float64(far):
         opacity = torch.full((int(cameras.height[0]), int(cameras.width[0])), 0.5, requires_grad=True)
         loss = hook.loss(lambda camera, drawn=opacity: drawn, 0, torch.Generator().manual_seed(1))
         step = torch.randn(300, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-        gone = hook.after_step(type("Cloud", (), {"means": hull.centre + 0.4 * step}), 0)
+        gone = hook.after_step(type("Cloud", (), {"means": torch.from_numpy(hull.centre) + 0.4 * step}), 0)
         found.append((xyz.double() - torch.from_numpy(hull.centre), loss["visdom_outside"], gone))
     (xyz, loss, gone), (far_xyz, far_loss, far_gone) = found
     assert (xyz - far_xyz).abs().max() < 1e-6 and torch.allclose(loss, far_loss, rtol=1e-3)
