@@ -21,8 +21,8 @@ class VisibleDomain(HullSettings):
     """Space that enough views see and whose views agree that it may be object.
 
     A voxel stays when it is inside the mask of at least `agreement` of the views that see its centre, and at
-    least `k` views see it. A view sees a point that is in front of the camera and inside the image; that
-    something else may be in the way does not count.
+    least `k` views see it. A view sees a point that is in front of the camera and inside the image. Occlusion is
+    ignored.
 
     Kinds: "visdom" is that rule. "traditional" is the same without `k`: one view is enough. "unit-sphere" is
     the traditional hull inside a ball. "released-go" is GaussianObject's published script: inside at least N - 1

@@ -1,4 +1,4 @@
-"""Grids that come from elsewhere: what must hold before they may be a hull."""
+"""Validation of grids from elsewhere, before they may be a hull."""
 
 from __future__ import annotations
 

@@ -10,9 +10,13 @@ import torch
 
 from tests.hull.balls import ball_masks, box_masks, moved, ring
 from visdom_plugin.errors import ConfigError, EmptyHullError
+from visdom_plugin.geometry.cameras import rays_of
 from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Grid, dense_carve, gather_silhouettes
+from visdom_plugin.hull.checks.check import check
+from visdom_plugin.hull.checks.coverage import measure_coverage
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.queries.raycast import cast
 
 BALLS = [((0.1, -0.2, 0.1), 0.5), ((0.5, 0.3, -0.1), 0.3)]
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -97,6 +101,32 @@ def test_hull_moves_with_the_world(scale):
     )
     # The box is right at any scale: the object takes most of its longest side.
     assert (other.extent[1] - other.extent[0]).max() > 0.6 * (other.bounds[1] - other.bounds[0]).max()
+
+
+@pytest.mark.parametrize("far", [1e5, 5e6])
+def test_a_frame_far_from_the_origin_changes_nothing(far):
+    cameras = ring(6)
+    masks = ball_masks(cameras, BALLS)
+    shift = far * np.array([1.0, -0.7, 0.3])
+    there = moved(cameras, np.eye(3), 1.0, shift)
+    domain = VisibleDomain(k="auto", resolution=100)
+    hull, other = domain.carve(cameras, masks), domain.carve(there, masks)
+    assert np.allclose(other.bounds - shift, hull.bounds, atol=0.01 * hull.voxel_size)
+    # Centres on a mask's outline may change sides: the projection cancels numbers as large as the shift.
+    assert (hull.occupancy != other.occupancy).sum() <= 1e-4 * hull.voxels
+    for one, two in zip(
+        measure_coverage(hull, cameras, masks), measure_coverage(other, there, masks), strict=True
+    ):
+        assert one == pytest.approx(two, abs=1e-3)
+    rays = rays_of(cameras[0])
+    one = cast(hull, rays.origins, rays.directions)
+    two = cast(other, rays.origins + torch.from_numpy(shift), rays.directions)
+    assert (one.hit != two.hit).sum() <= 2 and one.hit.any()
+    gap = (one.t_first - two.t_first)[one.hit & two.hit].abs()
+    assert gap.median() < 1e-4 * hull.voxel_size and (gap > hull.voxel_size).float().mean() < 1e-3
+    found, again = check(cameras, masks), check(there, masks)
+    assert [f.kind for f in found.findings] == [f.kind for f in again.findings]
+    assert found.advice.k == again.advice.k
 
 
 def test_hull_of_a_ball_approaches_the_ball():

@@ -114,10 +114,12 @@ def check_views(
 ) -> Check:
     """`hull.check.check` of a scene's views; `layout` is that of a scene on disk."""
     from visdom_plugin.hull.checks.check import check
+    from visdom_plugin.hull.checks.covisibility import IN_COMMANDS
     from visdom_plugin.hull.checks.pose_conventions import pose_faults
 
     images = () if brief else views.images
-    return check(views.cameras, masks, images, views.names, k=k, brief=brief, poses=pose_faults(layout))
+    poses = pose_faults(layout)
+    return check(views.cameras, masks, images, views.names, k=k, brief=brief, poses=poses, set_k=IN_COMMANDS)
 
 
 def describe_check(found: Check, names: Sequence[str]) -> dict[str, Any]:

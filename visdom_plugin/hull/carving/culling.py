@@ -1,4 +1,4 @@
-"""Which pieces of a hull the masks need: a piece stays when it explains foreground that no better piece explains.
+"""Culling of a hull's pieces: one stays when it explains foreground that no better piece explains.
 
 Every piece satisfies the keep rule, also those beside the object where a few views agree by chance. But the
 silhouettes of such a stray lie inside those of the object, while a part of the object that broke off, however

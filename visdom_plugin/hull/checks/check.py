@@ -13,13 +13,13 @@ from torch import Tensor
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.covisibility import (
+    IN_PROGRAM,
     LEAST_K,
     LOST,
     USUAL_K,
     Advice,
     advise_k,
     measure_spread,
-    ways_to_set_k,
 )
 from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines, draw_outlines
 from visdom_plugin.hull.checks.fault_hypotheses import QUIET_PX, Suspicion, find_causes
@@ -46,12 +46,12 @@ _RAYS, _BRIEF_VIEWS = 1024, 16
 
 @dataclass(frozen=True)
 class Check:
-    """What `check` found."""
+    """The result of `check`."""
 
     findings: list[Finding]
     """Faults, most serious first."""
     notes: list[Finding]
-    """What is worth knowing but does not make the capture faulty."""
+    """Remarks that do not make the capture faulty."""
     advice: Advice | None
     """The K that the views allow; None when there are not two usable views."""
     fit: Coherence | None
@@ -69,6 +69,7 @@ def check(
     k: int | None = None,
     brief: bool = False,
     poses: PoseFaults = IN_MEMORY,
+    set_k: str = IN_PROGRAM,
 ) -> Check:
     """Looks for every fault that shows in cameras and masks, and for photographs that occur twice.
 
@@ -80,6 +81,7 @@ def check(
         k: the K that is going to be used; by default it is to be advised.
         brief: a fraction of a second; names a fault but not always its cause, and compares 16 views at most.
         poses: what to say of wrong poses, in the terms of where they are from.
+        set_k: how K is set there, with {k} for its value.
     """
     own = [np.asarray(m.detach().cpu() if isinstance(m, Tensor) else m).astype(bool) for m in masks]
     names = Name([f"view {i}" for i in range(len(own))] if names is None else names)
@@ -124,7 +126,7 @@ def check(
     if left.sum() >= 2 and not any(c.kind in ("axes", "scale", "order", "swapped") for c in causes):
         kept = Name([names[i] for i in usable[left]])
         advice = advise_k(rest, kept, fit, USUAL_K if k is None else k)
-        found += _covisibility(advice, usable[left], k, names)
+        found += _covisibility(advice, usable[left], k, names, set_k)
         found += _clustered(rest, fit, chosen)
     notes, found = _split(found)
     found.sort(key=lambda f: ("certain", "likely", "possible").index(f.sure))
@@ -312,7 +314,9 @@ def _disagreement(fit: Coherence, views: np.ndarray, names: Name) -> Finding:
     )
 
 
-def _covisibility(advice: Advice, views: np.ndarray, asked: int | None, names: Name) -> list[Finding]:
+def _covisibility(
+    advice: Advice, views: np.ndarray, asked: int | None, names: Name, set_k: str
+) -> list[Finding]:
     if not advice.covered:
         return []
     wanted, found = USUAL_K if asked is None else asked, []
@@ -322,7 +326,7 @@ def _covisibility(advice: Advice, views: np.ndarray, asked: int | None, names: N
         else:
             what = f"too little is seen in common for K = {wanted}: {advice.why.partition(': ')[2]}"
             lost = advice.covered[LEAST_K] - advice.covered[advice.k + 1]
-        todo = f'use {ways_to_set_k(advice.k)} or k="auto", or views that show more of the object in common'
+        todo = f"use K = {advice.k} ({set_k.format(k=advice.k)}), or views that show more of the object in common"
         found.append(_seen(what, views, lost, todo, note=asked is None))
     alone = advice.covered[1] - advice.covered[LEAST_K]
     if alone.max() > LOST:

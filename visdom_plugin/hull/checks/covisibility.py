@@ -18,6 +18,9 @@ from visdom_plugin.hull.checks.silhouette_consistency import (
 
 USUAL_K, LEAST_K = 3, 2
 """K = 1 is never advised: what one view alone sees is closed by no other, and its hull reaches the cameras."""
+IN_PROGRAM = "VisibleDomain(k={k})"
+IN_COMMANDS = "visdom-hull -k {k}, visdom-train --method.hull.k {k}"
+"""How K is set, for sentences."""
 LOST = 0.02
 """A K may leave this share of a mask's rays without support beyond what LEAST_K leaves."""
 _TOLERANCE_PX = 1.0
@@ -85,11 +88,6 @@ def _say(chosen: int, most: int, covered: dict[int, np.ndarray], names: Name) ->
         f"K = {chosen}: every mask keeps its object (least {names[least]}, {covered[chosen][least]:.1%} of "
         f"its rays have a point that {chosen} views see)"
     )
-
-
-def ways_to_set_k(k: int) -> str:
-    """How K is set, wherever the hull is asked for."""
-    return f"K = {k} (visdom-hull -k {k}, visdom-train --method.hull.k {k}, VisibleDomain(k={k}))"
 
 
 class Spread(NamedTuple):

@@ -20,13 +20,15 @@ from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Silhouettes
 from visdom_plugin.hull.checks.check import check
 from visdom_plugin.hull.checks.coverage import estimate_coverage, measure_coverage
-from visdom_plugin.hull.checks.covisibility import LEAST_K, USUAL_K, ways_to_set_k
+from visdom_plugin.hull.checks.covisibility import IN_COMMANDS, IN_PROGRAM, LEAST_K, USUAL_K
 from visdom_plugin.hull.checks.findings import Finding, Name
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.settings import HullSettings
 
 log = logging.getLogger(__name__)
 
+_SET_K = f"{IN_COMMANDS}, {IN_PROGRAM}"
+"""A carve does not know who asked for it."""
 _LOOK = "look at each view's part in it: visdom-hull DIR --diagnose"
 _COARSE = 64
 """Voxels per side of a trial hull."""
@@ -61,7 +63,8 @@ def explain_empty(settings: HullSettings, cameras: Cameras, silhouettes: Silhoue
     fault = next((f for f in faults if f.kind not in _AFTER_SETTINGS), None)
     if fault is None and k > views:
         only = "is only 1 view" if views == 1 else f"are only {views} views"
-        less = f", or {ways_to_set_k(min(USUAL_K, views))} or less" if views >= LEAST_K else ""
+        fewer = min(USUAL_K, views)
+        less = f", or K = {fewer} ({_SET_K.format(k=fewer)}) or less" if views >= LEAST_K else ""
         return EmptyHullError(
             what,
             where="k",
@@ -75,7 +78,9 @@ def explain_empty(settings: HullSettings, cameras: Cameras, silhouettes: Silhoue
             return EmptyHullError(what, where=setting, cause=cause, todo=todo)
         fault = next(iter(faults), None)
     if fault is None:
-        return EmptyHullError(what, todo=f"{_LOOK}, or let some views miss: --max-misses 1")
+        return EmptyHullError(
+            what, todo=f"{_LOOK}, or let some views miss: --max-misses 1, VisibleDomain(max_misses=1)"
+        )
     return EmptyHullError(what, where=_where(fault), cause=_cause(fault), todo=_todo(fault))
 
 
@@ -119,10 +124,11 @@ def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouett
 
 
 def _faults(settings: HullSettings, cameras: Cameras, silhouettes: Silhouettes) -> list[Finding]:
-    """What the check finds and that can empty a hull, most serious first and each kind once."""
+    """Findings of the check that can empty a hull, most serious first, one of each kind."""
     masks = [silhouettes.mask(i) for i in range(len(silhouettes))]
     rule = KeepRule.of(settings, len(silhouettes))
-    found = check(cameras, masks, k=rule.least_visible if settings.kind == "visdom" else None)
+    asked = rule.least_visible if settings.kind == "visdom" else None
+    found = check(cameras, masks, k=asked, set_k=_SET_K)
     groups: dict[str, list[Finding]] = {}
     for f in found.findings:
         # Equal masks that fit the others are those of a symmetric object.

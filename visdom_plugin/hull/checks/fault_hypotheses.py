@@ -241,7 +241,7 @@ def _whole_trials(
 
 
 def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence, poses: PoseFaults) -> str:
-    """What would mend one view, or nothing."""
+    """The change that would mend one view, in words; empty for none."""
 
     def one(change: Change) -> Outlines:
         changed = change(outlines)

@@ -25,7 +25,7 @@ _NEAR = 0.02
 
 
 class Residuals(NamedTuple):
-    """What `march_rays` found: rays in rows, grouped by their view."""
+    """The result of `march_rays`: rays in rows, grouped by their view."""
 
     view: np.ndarray
     """(R,) int64."""

@@ -40,7 +40,7 @@ def cut_level(radius: float) -> float:
 
 
 @kernel()
-def _blur_slabs(begin, end, u, weights, out):
+def _blur_slabs(begin: int, end: int, u: np.ndarray, weights: np.ndarray, out: np.ndarray) -> None:
     """Blurs the slabs x = const along y and z."""
     _, ny, nz = u.shape
     reach = len(weights) // 2
@@ -62,7 +62,10 @@ def _blur_slabs(begin, end, u, weights, out):
 
 
 @kernel()
-def _finish_rows(begin, end, half, weights, cut, slope, cap, blurred, u):
+def _finish_rows(
+    begin: int, end: int, half: np.ndarray, weights: np.ndarray, cut: float, slope: float, cap: np.ndarray,
+    blurred: np.ndarray, u: np.ndarray,
+) -> None:  # fmt: skip
     """Blurs rows (x, y), flattened, along x; cuts and caps them."""
     nx, ny, nz = half.shape
     reach = len(weights) // 2

@@ -106,7 +106,10 @@ def draw_rays(cameras: Cameras, silhouettes: Silhouettes, grid: Grid, *, every_p
 
 
 @kernel(inline="always")
-def _enter(origin, direction, shape, voxel, step, ahead, apart):
+def _enter(
+    origin: np.ndarray, direction: np.ndarray, shape: tuple[int, ...], voxel: np.ndarray, step: np.ndarray,
+    ahead: np.ndarray, apart: np.ndarray,
+) -> bool:  # fmt: skip
     """Puts a ray at its first voxel; returns whether it meets the grid at all.
 
     Comes out: the voxel, +-1 along each axis, t of the next plane along each axis, t between planes.
@@ -131,7 +134,9 @@ def _enter(origin, direction, shape, voxel, step, ahead, apart):
 
 
 @kernel(inline="always")
-def _go_on(shape, voxel, step, ahead, apart):
+def _go_on(
+    shape: tuple[int, ...], voxel: np.ndarray, step: np.ndarray, ahead: np.ndarray, apart: np.ndarray,
+) -> bool:  # fmt: skip
     """Takes a ray to its next voxel; returns whether that is in the grid."""
     a = 0 if ahead[0] <= ahead[1] and ahead[0] <= ahead[2] else (1 if ahead[1] <= ahead[2] else 2)
     voxel[a] += step[a]
@@ -140,7 +145,10 @@ def _go_on(shape, voxel, step, ahead, apart):
 
 
 @kernel()
-def _meet(begin, end, origins, directions, views, squares, u, state):
+def _meet(
+    begin: int, end: int, origins: np.ndarray, directions: np.ndarray, views: np.ndarray,
+    squares: np.ndarray, u: np.ndarray, state: np.ndarray,
+) -> None:  # fmt: skip
     shape = u.shape
     voxel, step, ahead, apart = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(3)
     for r in range(begin, end):
@@ -153,7 +161,10 @@ def _meet(begin, end, origins, directions, views, squares, u, state):
 
 
 @kernel(inline="always")
-def _count_missed(view, i, j, k, projections, sizes, starts, state):
+def _count_missed(
+    view: int, i: int, j: int, k: int, projections: np.ndarray, sizes: np.ndarray, starts: np.ndarray,
+    state: np.ndarray,
+) -> int:  # fmt: skip
     """Views in which a voxel lies on a ray that misses the shape; `view` is one."""
     count = 1
     x, y, z = i + 0.5, j + 0.5, k + 0.5
@@ -170,21 +181,10 @@ def _count_missed(view, i, j, k, projections, sizes, starts, state):
 
 @kernel()
 def _choose(
-    begin,
-    end,
-    missed,
-    origins,
-    directions,
-    views,
-    projections,
-    sizes,
-    starts,
-    cap,
-    blurred,
-    cut,
-    state,
-    chosen,
-):
+    begin: int, end: int, missed: np.ndarray, origins: np.ndarray, directions: np.ndarray, views: np.ndarray,
+    projections: np.ndarray, sizes: np.ndarray, starts: np.ndarray, cap: np.ndarray, blurred: np.ndarray,
+    cut: float, state: np.ndarray, chosen: np.ndarray,
+) -> None:  # fmt: skip
     shape = cap.shape
     voxel, step, ahead, apart = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(3)
     for m in range(begin, end):
@@ -202,7 +202,7 @@ def _choose(
 
 
 @kernel()
-def _fill_balls(centres, ball, cap, u):
+def _fill_balls(centres: np.ndarray, ball: float, cap: np.ndarray, u: np.ndarray) -> None:
     nx, ny, nz = u.shape
     reach = int(ball)
     for m in range(len(centres)):

@@ -1,4 +1,4 @@
-"""How far a hull is from a surface that is known: distances between points on both, and the volume they share."""
+"""Distance of a hull from a known surface: between points on both, and the volume they share."""
 
 from __future__ import annotations
 
