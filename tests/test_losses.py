@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from visdom_plugin.hooks.regularizer import outside_loss
-from visdom_plugin.losses import below_one, composite, disparity_loss, mask_loss, photometric_loss
+from visdom_plugin.losses import below_one, composite_target, disparity_loss, mask_loss, photometric_loss
 from visdom_plugin.nerf.rendering.volume import weights_from_density
 from visdom_plugin.ssim import ssim
 
@@ -126,10 +126,12 @@ def test_an_unknown_mask_asks_for_colour_and_for_no_opacity():
     for a in (0.0, 0.4, 1.0):
         alpha = torch.full((24, 20), a)
         render = image * a + background * (1 - a)
-        torch.testing.assert_close(composite(image, mask, background, alpha=alpha, mask_known=False), render)
+        torch.testing.assert_close(
+            composite_target(image, mask, background, alpha=alpha, mask_known=False), render
+        )
     known = torch.rand(24, 20) > 0.5
-    mixed = composite(image, mask, background, alpha=torch.zeros(24, 20), mask_known=known)
+    mixed = composite_target(image, mask, background, alpha=torch.zeros(24, 20), mask_known=known)
     assert torch.equal(mixed[known], image[known]) and (mixed[~known] == background).all()
     assert torch.equal(
-        composite(image, mask, background), composite(image, mask, background, mask_known=True)
+        composite_target(image, mask, background), composite_target(image, mask, background, mask_known=True)
     )

@@ -8,7 +8,7 @@ from torch import Tensor
 from visdom_plugin.ssim import ssim
 
 
-def composite(
+def composite_target(
     image: Tensor,
     mask: Tensor,
     background: Tensor,

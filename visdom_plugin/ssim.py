@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 
 RADIUS = 5
 TAPS = 2 * RADIUS + 1
@@ -67,7 +67,7 @@ class _Ssim(torch.autograd.Function):
         window = _window().astype(images[0].dtype)
         sums = np.zeros(count * height, np.float64)
         slopes = np.empty((3, *images[0].shape) if with_slopes else (3, 0, 0, 0), images[0].dtype)
-        spread(_similarity, count * height, ROWS_PER_PIECE, *images, shape[-1], window, sums, slopes)
+        parallel_for(_similarity, count * height, ROWS_PER_PIECE, *images, shape[-1], window, sums, slopes)
         ctx.save_for_backward(x, y)
         ctx.rest = (shape[-1], window, slopes)
         return x.new_tensor(sums.sum() / max(images[0].size, 1))
@@ -80,7 +80,7 @@ class _Ssim(torch.autograd.Function):
         images = [z.detach().reshape(slopes.shape[1:]).contiguous().numpy() for z in (x, y)]
         out = np.empty_like(images[0])
         scale = out.dtype.type(float(g) / max(out.size, 1))
-        spread(
+        parallel_for(
             _gradient,
             out.shape[0] * out.shape[1],
             ROWS_PER_PIECE,

@@ -28,7 +28,7 @@ from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.integrations.nerfstudio import fields, methods, splats
 from visdom_plugin.integrations.nerfstudio.dataparser import METADATA, VisdomDataParserConfig
-from visdom_plugin.integrations.nerfstudio.frame import frame_of
+from visdom_plugin.integrations.nerfstudio.frame import similarity_of
 from visdom_plugin.integrations.nerfstudio.rays import bound_model_rays
 
 from ..datamodules.prepared_writer import write_prepared
@@ -425,7 +425,7 @@ def test_the_page_of_the_docs_trains_measures_and_resumes(tmp_path, monkeypatch)
     call(training.entrypoint, *words)
     assert [p.name for p in run.glob("nerfstudio_models/*")] == ["step-000000002.ckpt"]
     transform = json.loads((run / "dataparser_transforms.json").read_text())
-    frame = frame_of(load(None, views=4, downscale=8).train.cameras)
+    frame = similarity_of(load(None, views=4, downscale=8).train.cameras)
     assert np.allclose(transform["transform"], frame.transform, atol=1e-6)
     assert transform["scale"] == frame.scale
     call(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import visdom_plugin
 from visdom_plugin.geometry.camera_paths import look_at_camera
 from visdom_plugin.geometry.cameras import Cameras, look_at_point, rays_of
-from visdom_plugin.integrations.nerfstudio.frame import Similarity, frame_of
+from visdom_plugin.integrations.nerfstudio.frame import Similarity, similarity_of
 
 
 def random_rotation(g):
@@ -98,7 +98,7 @@ def test_points_keep_their_dtype_into_the_model(dtype):
 @seeds
 def test_frame_of_a_capture(seed):
     cameras = random_cameras(seed)
-    frame = frame_of(cameras)
+    frame = similarity_of(cameras)
     rotation = frame.transform[:, :3]
     assert torch.allclose(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64), atol=1e-12)
     assert torch.linalg.det(rotation) > 0
@@ -116,7 +116,7 @@ def test_frame_moves_with_the_capture():
     motion[:, :3, :3] = other.transform[:, :3] @ motion[:, :3, :3]
     motion[:, :3, 3] = other.points_to_model(motion[:, :3, 3])
     moved = Cameras(cameras.intrinsics, motion, cameras.width, cameras.height)
-    one, two = frame_of(cameras).poses_to_model(cameras), frame_of(moved).poses_to_model(moved)
+    one, two = similarity_of(cameras).poses_to_model(cameras), similarity_of(moved).poses_to_model(moved)
     assert torch.allclose(one[:, 2], two[:, 2], atol=1e-6)
     gram = [p[:, :, 3] @ p[:, :, 3].mT for p in (one, two)]
     assert torch.allclose(*gram, atol=1e-6)

@@ -8,7 +8,7 @@ import torch
 from datamodules import load
 from visdom_plugin import Hull, VisDomSampler
 from visdom_plugin.geometry.cameras import rays_of
-from visdom_plugin.integrations.nerfstudio.frame import Similarity, frame_of
+from visdom_plugin.integrations.nerfstudio.frame import Similarity, similarity_of
 from visdom_plugin.integrations.nerfstudio.pictures import write_pictures
 from visdom_plugin.integrations.nerfstudio.rays import bound_model_rays
 from visdom_plugin.scene import Views
@@ -84,7 +84,7 @@ def test_hull_of_a_scene_is_met_through_the_frame():
     from visdom_plugin.hull.domain import VisibleDomain
 
     hull = VisibleDomain(resolution=64).carve(views.cameras, views.masks)
-    frame, hook = frame_of(views.cameras), VisDomSampler(hull)
+    frame, hook = similarity_of(views.cameras), VisDomSampler(hull)
     poses = frame.poses_to_model(views.cameras)
     for i, mask in enumerate(views.masks):
         world = rays_of(views.cameras[i])

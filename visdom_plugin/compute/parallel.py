@@ -26,7 +26,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
-def spread(kernel, count: int, grain: int, *arguments) -> None:
+def parallel_for(kernel, count: int, grain: int, *arguments) -> None:
     """Runs `kernel(begin, end, *arguments)` over [0, count) in pieces of `grain` items.
 
     Pieces go to whichever thread is free, so a kernel must write only what belongs to its own items; then the

@@ -15,8 +15,3 @@ MAX_DEGREE = 3
 def sh_from_rgb(rgb: Tensor) -> Tensor:
     """Constant coefficients (..., 3) that show the colours (..., 3) from every side."""
     return (rgb - 0.5) / C0
-
-
-def rgb_from_sh(dc: Tensor) -> Tensor:
-    """Colours (..., 3), not clamped, of constant coefficients (..., 3)."""
-    return dc * C0 + 0.5

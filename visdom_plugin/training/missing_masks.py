@@ -1,10 +1,9 @@
 """Views without a mask: the hull of the views that have one stands in.
 
 The outline of that hull, seen by the view, holds the object wherever the other masks are right, and usually some
-of the background beside it. As "hull" it is the view's mask. As "colour" it only says where the view is looked
-at: outside nothing is asked, inside the photograph's colours are asked of whatever the model has there (see
-`losses.composite`), and the mask loss is left out. In neither case does the view carve: its outline comes from
-the others and would count their votes twice.
+of the background beside it. With `hull` it is the view's mask. With `colour`, pixels outside the outline are
+ignored; inside, only colour is supervised and opacity is free (`losses.composite_target`), without a mask loss.
+In neither case does the view carve: its outline comes from the others and would count their votes twice.
 
 Nothing stands in for the mask of a test view: a render measured against the hull's outline would be praised for
 filling the hull. Such a view is rendered and not measured.

@@ -54,22 +54,6 @@ def test_antialiased_loss_changes_smoothly_as_the_proposal_slides():
     assert smooth.diff().abs().max() < 0.01 * smooth.max()
 
 
-def test_interlevel_loss_is_zero_for_an_upper_envelope_only():
-    t, w = _histograms(20, 8)
-    t_prop, _ = _histograms(20, 12, seed=1)
-    t_prop[:, 0], t_prop[:, -1] = 0, 1
-    reaches = (t[:, None, :-1] < t_prop[:, 1:, None]) & (t_prop[:, :-1, None] < t[:, None, 1:])
-    envelope = (reaches * w[:, None]).sum(-1)
-    torch.testing.assert_close(
-        proposal_losses.interlevel_loss(t, w, t_prop, envelope), torch.zeros(20).double()
-    )
-    assert (proposal_losses.interlevel_loss(t, w, t_prop, 0.01 * envelope) > 0).all()
-    w_prop = _histograms(20, 12, seed=2)[1]
-    bound = (reaches * w_prop[..., None]).sum(1)
-    expected = ((w - bound).clamp_min(0) ** 2 / (w + 1e-5)).sum(-1)
-    torch.testing.assert_close(proposal_losses.interlevel_loss(t, w, t_prop, w_prop), expected)
-
-
 def test_distortion_is_the_mean_distance_of_two_points():
     t, w = _histograms(4, 6)
     fine = 60  # points per interval, at their middles
@@ -102,13 +86,12 @@ def test_distortion_scales_and_vanishes():
     )
 
 
-@pytest.mark.parametrize("name", ["antialiased", "sharp", "distortion"])
+@pytest.mark.parametrize("name", ["antialiased", "distortion"])
 def test_gradients_equal_finite_differences(name):
     t, w = _histograms(5, 6)
     t_prop, w_prop = _histograms(5, 7, seed=1)
     loss = {
         "antialiased": lambda x: proposal_losses.antialiased_interlevel_loss(t, w, t_prop, x, 0.02, eps=1e-2),
-        "sharp": lambda x: proposal_losses.interlevel_loss(t, w, t_prop, x, eps=1e-2),
         "distortion": lambda x: proposal_losses.distortion_loss(t_prop, x),
     }[name]
     assert torch.autograd.gradcheck(loss, [w_prop.requires_grad_()])
@@ -118,8 +101,4 @@ def test_the_nerf_learns_nothing_from_the_proposals():
     t, w = _histograms(5, 6)
     t_prop, w_prop = _histograms(5, 7, seed=1)
     w.requires_grad_()
-    for loss in (
-        proposal_losses.interlevel_loss,
-        lambda *a: proposal_losses.antialiased_interlevel_loss(*a, 0.02),
-    ):
-        assert not loss(t, w, t_prop, w_prop).requires_grad
+    assert not proposal_losses.antialiased_interlevel_loss(t, w, t_prop, w_prop, 0.02).requires_grad

@@ -38,13 +38,11 @@ def _cases():
         "packed": (_render_packed, packed, (0, 1)),
         "dense": (_render_dense, (weights * 90, torch.rand(50, 16, 3), edges, torch.rand(50, 3)), (0, 1)),
         "sample": (step_functions.sample_edges, (edges, weights, 20, torch.rand(50, 1)), ()),
-        "dilate": (step_functions.dilate, (edges, weights, 0.02), ()),
         "antialiased": (
             proposal_losses.antialiased_interlevel_loss,
             (edges, weights, other, proposed, 0.03, 1e-2),
             (3,),
         ),
-        "sharp": (proposal_losses.interlevel_loss, (edges, weights, other, proposed, 1e-2), (3,)),
         "distortion": (proposal_losses.distortion_loss, (edges, weights), (1,)),
         "hexagons": (multisampling.multisample, hexagons, ()),
         "random hexagons": (multisampling.multisample, (*hexagons, torch.rand(50, 16)), ()),

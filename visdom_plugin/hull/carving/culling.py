@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.octree import Areas
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes, axis_terms
@@ -97,10 +97,10 @@ def _shell(pieces: Pieces, occupancy: np.ndarray, stretch: np.ndarray) -> tuple[
     whole = np.stack([*np.divmod(column, occupancy.shape[1]), pieces.begins[order], pieces.ends[order]], -1)
     coarse = stretch[pieces.labels[order]]
     grid, counts = occupancy.view(np.uint8), np.zeros(len(whole), np.int64)
-    spread(_list_shell, len(whole), 4096, whole, coarse, grid, counts, np.empty((0, 4), np.int64))
+    parallel_for(_list_shell, len(whole), 4096, whole, coarse, grid, counts, np.empty((0, 4), np.int64))
     starts = np.concatenate([[0], np.cumsum(counts)])
     runs = np.empty((starts[-1], 4), np.int64)
-    spread(_list_shell, len(whole), 4096, whole, coarse, grid, starts, runs)
+    parallel_for(_list_shell, len(whole), 4096, whole, coarse, grid, starts, runs)
     return runs, starts[np.searchsorted(pieces.labels[order], np.arange(len(pieces.sizes) + 1))]
 
 
@@ -203,11 +203,11 @@ def _draw(
     inputs = (runs, bounds, stretch, *terms, focal * grid.voxel, *canvas)
     views = len(silhouettes)
     counts = np.zeros((len(bounds) - 1, views), np.int64)
-    spread(_trace, views, 1, *inputs, counts, np.empty(0, np.int32))
+    parallel_for(_trace, views, 1, *inputs, counts, np.empty(0, np.int32))
     ends = np.cumsum(counts).reshape(counts.shape)
     starts = np.concatenate([ends[:, :1] - counts[:, :1], ends], 1)
     pixels = np.empty(counts.sum(), np.int32)
-    spread(_trace, views, 1, *inputs, starts, pixels)
+    parallel_for(_trace, views, 1, *inputs, starts, pixels)
     return _Drawn(starts, pixels)
 
 

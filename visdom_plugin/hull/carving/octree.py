@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes, axis_terms
 
@@ -54,7 +54,7 @@ def sum_areas(silhouettes: Silhouettes) -> Areas:
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
     tables = np.empty(int(counts.sum()), np.int32)
     inputs = (silhouettes.pixels, silhouettes.sizes, silhouettes.offsets, starts)
-    spread(_sum_areas, len(silhouettes), 1, *inputs, tables)
+    parallel_for(_sum_areas, len(silhouettes), 1, *inputs, tables)
     return tables, starts
 
 
@@ -169,7 +169,7 @@ def classify_cells(
     tables, starts = areas
     states = np.empty(len(cells), np.uint8)
     inputs = (cells, *terms, rounding_bounds(terms), silhouettes.sizes, starts, tables, rule.table())
-    spread(_classify, len(cells), _GRAIN, *inputs, states)
+    parallel_for(_classify, len(cells), _GRAIN, *inputs, states)
     return states
 
 
@@ -199,7 +199,7 @@ def keep_centres(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, cells: np
     terms = axis_terms(silhouettes.projections, [grid.centres(a) for a in range(3)])
     kept = np.empty(len(cells), np.bool_)
     inputs = (cells, *terms, silhouettes.sizes, silhouettes.offsets, silhouettes.pixels, rule.table())
-    spread(_keep_centres, len(cells), _GRAIN, *inputs, kept)
+    parallel_for(_keep_centres, len(cells), _GRAIN, *inputs, kept)
     return kept
 
 
@@ -332,5 +332,5 @@ def block_carve(
     out = np.zeros(grid.shape, np.uint8)
     blocks = int(np.prod([-(-n // _TOP) for n in grid.shape]))
     inputs = (silhouettes.sizes, silhouettes.offsets, silhouettes.pixels, starts, tables, rule.table())
-    spread(_carve, blocks, 4, *terms, rounding_bounds(terms), *inputs, out)
+    parallel_for(_carve, blocks, 4, *terms, rounding_bounds(terms), *inputs, out)
     return out.view(bool)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.hull.checks.distance_fields import Outlines
 
 CAP_PX = 16.0
@@ -53,7 +53,7 @@ def _cut(c0: float, c1: float, low: float, high: float) -> tuple[float, float]:
 
 
 @kernel()
-def _march(
+def _follow_rays(
     begin: int, end: int, view: np.ndarray, uv: np.ndarray, motions: np.ndarray, centres: np.ndarray,
     intrinsics: np.ndarray, projections: np.ndarray, sizes: np.ndarray, offsets: np.ndarray,
     fields: np.ndarray, least: int, near: float, far: float, ball: np.ndarray, radius: float, step: float,
@@ -218,8 +218,8 @@ def march_rays(
     )
     whole, without = np.empty(count), np.empty((count, views))
     ends, counts = np.empty((count, 2, 3)), np.ones(count, np.bool_)
-    spread(
-        _march, count, 64, view, uv, outlines.rotations, outlines.centres, outlines.intrinsics,
+    parallel_for(
+        _follow_rays, count, 64, view, uv, outlines.rotations, outlines.centres, outlines.intrinsics,
         outlines.projections, sizes, offsets, fields, least, near, far, centre, radius, step_px,
         whole, without, ends, counts,
     )  # fmt: skip

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 
 _ONES = np.uint64(0x0101010101010101)
 _GRAIN = 16
@@ -143,12 +143,12 @@ def find_pieces(occupancy: np.ndarray) -> Pieces:
     """Connected pieces of an (X, Y, Z) bool grid."""
     grid = occupancy.view(np.uint8)
     counts = np.zeros(grid.shape[0] * grid.shape[1], np.int64)
-    spread(_count_runs, len(grid), _GRAIN, grid, counts)
+    parallel_for(_count_runs, len(grid), _GRAIN, grid, counts)
     starts = np.concatenate([[0], np.cumsum(counts)])
     begins, ends = (np.empty(starts[-1], np.int32) for _ in range(2))
     aligned = grid.shape[2] % 8 == 0
     words = grid.view(np.uint64) if aligned else np.zeros((1, 1, 0), np.uint64)
-    spread(_list_runs, len(grid), _GRAIN, grid, words, starts, begins, ends)
+    parallel_for(_list_runs, len(grid), _GRAIN, grid, words, starts, begins, ends)
     parents = np.arange(starts[-1])
     _join(grid.shape[0], grid.shape[1], starts, begins, ends, parents)
     labels, sizes = np.empty(starts[-1], np.int32), np.zeros(starts[-1], np.int64)
@@ -159,7 +159,7 @@ def find_pieces(occupancy: np.ndarray) -> Pieces:
 def erase_pieces(occupancy: np.ndarray, pieces: Pieces, keep: np.ndarray) -> None:
     """Clears, in place, the pieces whose entry in `keep` (C,) bool is False."""
     inputs = (pieces.column_starts, pieces.begins, pieces.ends, pieces.labels, keep)
-    spread(_erase, len(occupancy), _GRAIN, occupancy.view(np.uint8), *inputs)
+    parallel_for(_erase, len(occupancy), _GRAIN, occupancy.view(np.uint8), *inputs)
 
 
 @kernel()
@@ -179,7 +179,7 @@ def piece_of(voxels: np.ndarray, shape: Sequence[int], pieces: Pieces) -> np.nda
     """(M,) piece of each of some voxels (M, 3) int64 of a grid, -1 where there is none."""
     out = np.empty(len(voxels), np.int64)
     inputs = (shape[1], pieces.column_starts, pieces.begins, pieces.ends, pieces.labels)
-    spread(_look_up, len(voxels), 1 << 14, voxels, *inputs, out)
+    parallel_for(_look_up, len(voxels), 1 << 14, voxels, *inputs, out)
     return out
 
 

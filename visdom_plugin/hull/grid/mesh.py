@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
@@ -227,14 +227,14 @@ def mesh_grid(occupancy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     table, counts = _cases()
     slabs = grid.shape[0] + 1
     triangles_of, vertices_of = np.zeros(slabs, np.int64), np.zeros(slabs, np.int64)
-    spread(_count_slabs, slabs, 16, grid, counts, triangles_of, vertices_of)
+    parallel_for(_count_slabs, slabs, 16, grid, counts, triangles_of, vertices_of)
     vertices = np.empty((int(vertices_of.sum()), 3))
     faces = np.empty((int(triangles_of.sum()), 3), np.int64)
     first_triangle = np.concatenate([[0], np.cumsum(triangles_of)])
     first_vertex = np.concatenate([[0], np.cumsum(vertices_of)])
     chunks = min(4, slabs)
     inputs = (grid, chunks, table, counts, _EDGE_AXES, _EDGE_OFFSETS, first_triangle, first_vertex)
-    spread(_build, chunks, 1, *inputs, vertices, faces)
+    parallel_for(_build, chunks, 1, *inputs, vertices, faces)
     return vertices, faces
 
 

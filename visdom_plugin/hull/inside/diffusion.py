@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 
 SIGMA = 1.0
 """Standard deviation of the blur, voxels."""
@@ -95,5 +95,5 @@ def diffuse(u: np.ndarray, cap: np.ndarray, radius: float, half: np.ndarray, blu
     """
     weights, (nx, ny, _) = blur_weights(), u.shape
     cut, slope = np.float32(cut_level(radius)), np.float32(_SLOPE)
-    spread(_blur_slabs, nx, 4, u, weights, half)
-    spread(_finish_rows, nx * ny, 256, half, weights, cut, slope, cap, blurred, u)
+    parallel_for(_blur_slabs, nx, 4, u, weights, half)
+    parallel_for(_finish_rows, nx * ny, 256, half, weights, cut, slope, cap, blurred, u)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes
 
@@ -217,7 +217,7 @@ def _fill_balls(centres: np.ndarray, ball: float, cap: np.ndarray, u: np.ndarray
 def find_met(rays: Rays, u: np.ndarray) -> np.ndarray:
     """What became of the ray of each square: uint8, 0 where there is none, 1 where it meets u > 0.5, else 2."""
     state = np.zeros(int(rays.starts[-1]), np.uint8)
-    spread(_meet, len(rays), 1024, rays.origins, rays.directions, rays.views, rays.squares, u, state)
+    parallel_for(_meet, len(rays), 1024, rays.origins, rays.directions, rays.views, rays.squares, u, state)
     return state
 
 
@@ -245,6 +245,6 @@ def give_back(
     missed = np.flatnonzero(state[rays.squares] == _MISSED)
     chosen = np.empty(len(missed), np.int64)
     lines = (rays.origins, rays.directions, rays.views, rays.projections, rays.sizes, rays.starts)
-    spread(_choose, len(missed), 64, missed, *lines, cap, blurred, cut, state, chosen)
+    parallel_for(_choose, len(missed), 64, missed, *lines, cap, blurred, cut, state, chosen)
     _fill_balls(np.unique(chosen[chosen >= 0]), ball, cap, u)
     return len(missed)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.hull import Hull, occupied_box
 
@@ -91,8 +91,8 @@ def build_bricks(occupancy: np.ndarray) -> Bricks:
     """Bricks of an (X, Y, Z) bool grid."""
     shape = tuple(-(-n // _BRICK) for n in occupancy.shape)
     bits, ahead = np.zeros(shape, np.uint64), np.empty((8, *shape), np.uint8)
-    spread(_pack, shape[0], 1, occupancy.view(np.uint8), bits)
-    spread(_look_ahead, 8, 1, bits, ahead)
+    parallel_for(_pack, shape[0], 1, occupancy.view(np.uint8), bits)
+    parallel_for(_look_ahead, 8, 1, bits, ahead)
     return Bricks(bits, ahead)
 
 
@@ -283,7 +283,7 @@ def _walk(
     shaped = (np.array(bricks.bits.shape), bricks.bits.reshape(-1), bricks.ahead.reshape(-1))
     rays = (origins.contiguous().numpy(), directions.contiguous().numpy())
     inputs = (*rays, lower, scale, box, *shaped, both)
-    spread(_cast, len(directions), _GRAIN, *inputs, first, last, hit)
+    parallel_for(_cast, len(directions), _GRAIN, *inputs, first, last, hit)
     near, far, met = (torch.from_numpy(x).reshape(shape) for x in (first, last, hit))
     return near, far, met
 

@@ -23,7 +23,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from datamodules import load
 from visdom_plugin.errors import VisDomError
 from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.integrations.nerfstudio.frame import Similarity, frame_of
+from visdom_plugin.integrations.nerfstudio.frame import Similarity, similarity_of
 from visdom_plugin.integrations.nerfstudio.pictures import TrainingViews, default_cache, write_pictures
 from visdom_plugin.scene import Scene
 
@@ -77,7 +77,7 @@ def told() -> Iterator[None]:
 
 
 class VisdomDataParser(DataParser):
-    """Loads through `datamodules`. The frame is made of the training cameras alone; see `frame.frame_of`."""
+    """Loads through `datamodules`. The frame is made of the training cameras alone; see `frame.similarity_of`."""
 
     config: VisdomDataParserConfig
 
@@ -85,7 +85,7 @@ class VisdomDataParser(DataParser):
         with told():
             training = split == "train"
             scene = self._load(test=not training)
-            frame = frame_of(scene.train.cameras)
+            frame = similarity_of(scene.train.cameras)
             views = scene.train if training else scene.test
             if not training and not len(views):
                 log.warning("the scene has no test views: evaluating on the training views")

@@ -65,7 +65,7 @@ class Similarity(NamedTuple):
         return transform[:, :3], transform[:, 3]
 
 
-def frame_of(cameras: Cameras) -> Similarity:
+def similarity_of(cameras: Cameras) -> Similarity:
     """The frame of a capture: look-at point at the origin, cameras at mean distance 1, their mean up is +z.
 
     Nerfstudio's contraction leaves [-1, 1]^3 as it is, so that the object lies in the uncontracted part.

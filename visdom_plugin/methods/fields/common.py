@@ -15,7 +15,7 @@ from torch import Tensor
 from visdom_plugin.geometry.cameras import Cameras, pixel_radius, rays_of
 from visdom_plugin.geometry.mesh_files import mesh_ply
 from visdom_plugin.hooks.protocols import SamplerHook
-from visdom_plugin.losses import composite, mask_loss
+from visdom_plugin.losses import composite_target, mask_loss
 from visdom_plugin.nerf.frame import Frame
 from visdom_plugin.nerf.optimiser import FieldOptimiser
 from visdom_plugin.render import Render
@@ -96,8 +96,8 @@ def warm_up(method: _Trainable, camera: Cameras) -> None:
 
 
 def photograph_on(background: Tensor, batch: PixelBatch, alpha: Tensor) -> Tensor:
-    """What a batch of pixels should look like on `background` (n, 3); see `losses.composite`."""
-    return composite(batch.rgb, batch.mask, background, alpha=alpha, mask_known=batch.mask_known)
+    """What a batch of pixels should look like on `background` (n, 3); see `losses.composite_target`."""
+    return composite_target(batch.rgb, batch.mask, background, alpha=alpha, mask_known=batch.mask_known)
 
 
 def psnr_of(error: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.losses import composite, mask_loss, photometric_loss
+from visdom_plugin.losses import composite_target, mask_loss, photometric_loss
 from visdom_plugin.render import Render
 from visdom_plugin.splat.cpu.backend import warm_up
 from visdom_plugin.splat.set_config import GaussianSetConfig
@@ -26,7 +26,9 @@ def fit_view(
         Weighted losses by name, and the PSNR in dB, a scalar without gradient.
     """
     weight = batch.weight
-    target = composite(batch.image, batch.mask, background, alpha=render.alpha, mask_known=batch.mask_known)
+    target = composite_target(
+        batch.image, batch.mask, background, alpha=render.alpha, mask_known=batch.mask_known
+    )
     errors = (render.rgb.detach() - target).square()
     mse = errors.mean() if weight is None else (errors.mean(-1) * weight).sum() / weight.sum().clamp_min(1)
     losses = {"photometric": photometric_loss(render.rgb, target, config.ssim_weight, weight)}

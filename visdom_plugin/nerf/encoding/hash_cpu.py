@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.nerf.encoding import hash_kernels
 from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 
@@ -55,7 +55,7 @@ class _Encode(torch.autograd.Function):
         if samples > hash_kernels.BLOCK:
             raise ValueError(f"groups of {samples} points; the CPU kernels take {hash_kernels.BLOCK} at most")
         blocks = -(-groups // (hash_kernels.BLOCK // samples))
-        spread(
+        parallel_for(
             hash_kernels.encode, layout.levels * blocks, max(blocks // PIECES_PER_LEVEL, 1), samples,
             _flat(points), _flat(scales), _flat(table), layout.features, *_describe(layout),
             _flat(out), _flat(mean_strengths),
@@ -69,7 +69,7 @@ class _Encode(torch.autograd.Function):
         points, scales = ctx.saved_tensors
         layout, samples = ctx.layout, ctx.samples
         g_table = torch.empty(layout.rows, layout.features)
-        spread(
+        parallel_for(
             hash_kernels.encode_backward, layout.levels, 1, samples, _flat(points), _flat(scales),
             _flat(g_out), layout.features, *_describe(layout), _flat(g_table),
         )  # fmt: skip

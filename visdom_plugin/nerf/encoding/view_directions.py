@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.geometry.harmonics import basis
 
 DIRECTIONS_PER_PIECE = 4096
@@ -25,7 +25,7 @@ def encode_harmonics(directions: Tensor) -> Tensor:
     flat = directions.detach().reshape(-1, 3)
     if flat.device.type == "cpu":
         out = np.empty((len(flat), 16), flat.contiguous().numpy().dtype)
-        spread(_harmonics, len(flat), DIRECTIONS_PER_PIECE, flat.contiguous().numpy(), out)
+        parallel_for(_harmonics, len(flat), DIRECTIONS_PER_PIECE, flat.contiguous().numpy(), out)
         return torch.from_numpy(out).reshape(*directions.shape[:-1], 16)
     return _harmonics_torch(flat).reshape(*directions.shape[:-1], 16)
 

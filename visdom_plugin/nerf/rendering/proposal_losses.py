@@ -38,23 +38,6 @@ def _antialiased_torch(t_nerf, w_nerf, t_prop, w_prop, half_width, eps):
     return ((target - w_prop).clamp_min(0).square() / (w_prop + eps)).sum(-1)
 
 
-def interlevel_loss(
-    t_nerf: Tensor, w_nerf: Tensor, t_prop: Tensor, w_prop: Tensor, eps: float = 1e-5
-) -> Tensor:
-    """mip-NeRF 360's (eq. 13): each NeRF weight, as far as it exceeds all proposal weights that overlap it.
-
-    Arguments and result as `antialiased_interlevel_loss`, the sum being over the NeRF's intervals.
-    """
-    w_nerf = w_nerf.detach()
-    t_prop = t_prop.contiguous()
-    mass = torch.nn.functional.pad(w_prop.cumsum(-1), (1, 0))
-    last = w_prop.shape[-1]
-    lower = (torch.searchsorted(t_prop, t_nerf[..., :-1].contiguous(), right=True) - 1).clamp(0, last)
-    upper = torch.searchsorted(t_prop, t_nerf[..., 1:].contiguous()).clamp(0, last)
-    bound = mass.gather(-1, upper) - mass.gather(-1, lower)
-    return ((w_nerf - bound).clamp_min(0).square() / (w_nerf + eps)).sum(-1)
-
-
 def distortion_loss(t: Tensor, w: Tensor) -> Tensor:
     """mip-NeRF 360's (eq. 15): the mean distance of two points drawn from the weights, exactly.
 

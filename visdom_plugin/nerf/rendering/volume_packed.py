@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.nerf.rendering.volume import EMPTY, MAX_DENSITY
 
 RAYS_PER_PIECE = 64
@@ -80,7 +80,7 @@ class _Composite(torch.autograd.Function):
         real = arrays[0].dtype
         colour, alpha, depth = np.empty((n, 3), real), np.empty(n, real), np.empty(n, real)
         weights, passed = np.empty(len(density), real), np.empty(len(density), real)
-        spread(_forward, n, RAYS_PER_PIECE, *arrays, colour, alpha, depth, weights, passed)
+        parallel_for(_forward, n, RAYS_PER_PIECE, *arrays, colour, alpha, depth, weights, passed)
         ctx.arrays = (*arrays[1:], alpha, depth, weights, passed)
         out = [torch.from_numpy(x) for x in (colour, alpha, depth, weights)]
         ctx.mark_non_differentiable(out[3])
@@ -97,7 +97,7 @@ class _Composite(torch.autograd.Function):
             np.empty((n, 3), rgb.dtype),
         )
         given = [g.contiguous().numpy() for g in (by_colour, by_alpha, by_depth)]
-        spread(_backward, n, RAYS_PER_PIECE, *ctx.arrays, *given, by_density, by_rgb, by_background)
+        parallel_for(_backward, n, RAYS_PER_PIECE, *ctx.arrays, *given, by_density, by_rgb, by_background)
         by_density, by_rgb, by_background = (torch.from_numpy(x) for x in (by_density, by_rgb, by_background))
         return by_density, by_rgb, None, None, None, by_background
 

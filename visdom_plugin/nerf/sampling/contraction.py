@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 
 POINTS_PER_PIECE = 16384
 BLOCK = 256
@@ -43,17 +43,11 @@ def _contract_torch(points: Tensor, std: Tensor | None):
     return contracted, std * across.square().div(r * r).pow(1 / 3)
 
 
-def uncontract(points: Tensor) -> Tensor:
-    """The inverse of `contract`: (..., 3) points of norm < 2 to (..., 3) points of any norm."""
-    norm = points.norm(dim=-1, keepdim=True).clamp_min(1)
-    return points / (norm * (2 - norm))
-
-
 def _contract_cpu(points: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
     flat = points.detach().reshape(-1, 3).contiguous().numpy()
     deviations = std.detach().float().expand(points.shape[:-1]).reshape(-1).contiguous().numpy()
     out, scaled = np.empty_like(flat), np.empty_like(deviations)
-    spread(_contract, len(flat), POINTS_PER_PIECE, flat, deviations, out, scaled)
+    parallel_for(_contract, len(flat), POINTS_PER_PIECE, flat, deviations, out, scaled)
     return torch.from_numpy(out).reshape(points.shape), torch.from_numpy(scaled).reshape(points.shape[:-1])
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 
 RAYS_PER_PIECE = 32
 
@@ -21,7 +21,7 @@ ANGLES = tuple(math.pi / 3 * k for k in (0, 2, 4, 3, 5, 1))
 STEPS = tuple(3 / math.sqrt(7) * (2 * j / 5 - 1) for j in range(6))
 
 
-def frame_of(directions: Tensor) -> tuple[Tensor, Tensor]:
+def axes_across(directions: Tensor) -> tuple[Tensor, Tensor]:
     """Two unit vectors (..., 3), a right-handed frame with unit directions (..., 3) (Duff et al. 2017)."""
     x, y, z = directions.unbind(-1)
     sign = torch.where(z < 0, -1.0, 1.0).to(z)
@@ -73,7 +73,7 @@ def _multisample_torch(origins, directions, distances, radius, random, std_scale
     else:
         angles = torch.where(random < 0.5, -1.0, 1.0)[..., None] * angles + 4 * math.pi * random[..., None]
     across = t * (radius[..., None, None] / math.sqrt(2))
-    first, second = frame_of(directions)
+    first, second = axes_across(directions)
     local = torch.stack([across * torch.cos(angles), across * torch.sin(angles), t], -1)
     frame = torch.stack([first, second, directions], -2)
     points = (local.flatten(-3, -2) @ frame).reshape(local.shape) + origins[..., None, None, :]
@@ -82,7 +82,7 @@ def _multisample_torch(origins, directions, distances, radius, random, std_scale
 
 def _multisample_cpu(origins, directions, distances, radius, random, std_scale):
     lead, sections = distances.shape[:-1], distances.shape[-1] - 1
-    first, second = frame_of(directions.detach())
+    first, second = axes_across(directions.detach())
     frame = torch.stack([first, second, directions.detach(), origins.detach()], -2).expand(*lead, 4, 3)
     count = radius.numel()
     random = distances.new_empty(count, 0) if random is None else random.expand(*lead, sections)
@@ -104,7 +104,7 @@ def _multisample_cpu(origins, directions, distances, radius, random, std_scale):
         points,
         std,
     )
-    spread(_hexagons, len(radius), RAYS_PER_PIECE, *arguments)
+    parallel_for(_hexagons, len(radius), RAYS_PER_PIECE, *arguments)
     return torch.from_numpy(points).reshape(*lead, sections, 6, 3), torch.from_numpy(std).reshape(
         *lead, sections, 6
     )

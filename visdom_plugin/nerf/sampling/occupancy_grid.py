@@ -10,7 +10,7 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 
 ROUNDING = -1e-3
 """In cells: rays that are cut to the cube end on its faces, and rounding puts their ends up to about 1e-4 outside.
@@ -223,10 +223,10 @@ def march(
     rays = [x.detach().float().contiguous().numpy() for x in (origins, directions, near, far, step, shift)]
     counts = np.zeros(len(origins), np.int64)
     world = (*rays, grid.occupied.numpy(), np.float32(grid.half_side))
-    spread(_count, len(origins), 128, *world, counts)
+    parallel_for(_count, len(origins), 128, *world, counts)
     offsets = np.concatenate([[0], np.cumsum(counts)])
     starts, ray = np.empty(offsets[-1], np.float32), np.empty(offsets[-1], np.int64)
-    spread(_fill, len(origins), 128, *world, offsets, starts, ray)
+    parallel_for(_fill, len(origins), 128, *world, offsets, starts, ray)
     starts, ray = torch.from_numpy(starts), torch.from_numpy(ray)
     return PackedSamples(torch.from_numpy(offsets), ray, starts, starts + step[ray])
 

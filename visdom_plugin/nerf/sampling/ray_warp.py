@@ -20,25 +20,10 @@ def power_ladder(x: Tensor, power: float, premultiplier: float = 1.0) -> Tensor:
     return ((x * (premultiplier / scale) + 1) ** power - 1) * (scale / power)
 
 
-def inverse_power_ladder(y: Tensor, power: float, premultiplier: float = 1.0) -> Tensor:
-    """The x (...) >= 0 whose `power_ladder` is y (...)."""
-    scale = abs(power - 1)
-    return ((y * (power / scale) + 1) ** (1 / power) - 1) * (scale / premultiplier)
-
-
-def normalise_distances(
-    t: Tensor, near: Tensor, far: Tensor, power: float = POWER, premultiplier: float = PREMULTIPLIER
-) -> Tensor:
-    """s (..., S) in [0, 1] of distances t (..., S) between near and far (..., 1). power 1 is linear."""
-    rung = _rung(power, premultiplier)
-    low, high = rung(near), rung(far)
-    return ((rung(t) - low) / (high - low)).clamp(0, 1)
-
-
 def distances_of(
     s: Tensor, near: Tensor, far: Tensor, power: float = POWER, premultiplier: float = PREMULTIPLIER
 ) -> Tensor:
-    """t (..., S) of normalised distances s (..., S): the inverse of `normalise_distances`.
+    """t (..., S) in [near, far] (..., 1) of normalised distances s (..., S) in [0, 1]. power 1 is linear.
 
     Interpolates (t/|p-1| + 1)^p itself, which keeps its precision where s is near 1 and far is huge.
     """

@@ -1,7 +1,7 @@
 """Step functions on a ray: S intervals between sorted edges t (..., S + 1), each with a weight (..., S), which is
 the mass in the interval (mass per length is called density). Nothing here carries a gradient.
 
-The maths of mip-NeRF 360 (resampling, dilation, annealing) and Zip-NeRF (blurring).
+The maths of mip-NeRF 360 (resampling, annealing) and Zip-NeRF (blurring).
 """
 
 from __future__ import annotations
@@ -62,65 +62,9 @@ def _interpolate(x: Tensor, y: Tensor, at: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def query(edges: Tensor, values: Tensor, at: Tensor) -> Tensor:
-    """Values (..., N) at points (..., N) of the function that is values (..., S) between edges, else 0.
-
-    An interval owns its lower edge.
-    """
-    index = torch.searchsorted(edges.contiguous(), at.contiguous(), right=True) - 1
-    found = values.gather(-1, index.clamp(0, values.shape[-1] - 1))
-    return torch.where((index >= 0) & (index < values.shape[-1]), found, 0)
-
-
-@torch.no_grad()
 def anneal(weights: Tensor, progress: float, slope: float = 10.0) -> Tensor:
     """weights^b with b from 0 to 1 as progress does (Schlick's bias; mip-NeRF 360, eq. 18): flat at the start."""
     return weights ** (slope * progress / ((slope - 1) * progress + 1))
-
-
-@torch.no_grad()
-def dilate(edges: Tensor, weights: Tensor, distance: float, low: float = 0.0, high: float = 1.0):
-    """The greatest density within `distance` of each point, normalised to the old mass (mip-NeRF 360, supplement).
-
-    Args:
-        edges: (..., S + 1). weights: (..., S).
-        distance: in the unit of the edges.
-        low, high: the domain, to which the new edges are clipped.
-
-    Returns:
-        edges (..., 3 S + 1) and weights (..., 3 S).
-    """
-    wide = torch.cat([edges, edges[..., :-1] - distance, edges[..., 1:] + distance], -1)
-    wide = wide.sort(-1).values.clamp(low, high)
-    if edges.device.type == "cpu":
-        arrays = (edges, weights, wide)
-        return wide, step_kernels.run(step_kernels.dilate, wide.shape[-1] - 1, arrays, distance)
-    return wide, _dilate_torch(edges, weights, distance, wide)
-
-
-def _dilate_torch(edges: Tensor, weights: Tensor, distance: float, wide: Tensor) -> Tensor:
-    tiny = torch.finfo(edges.dtype).tiny
-    width = edges.diff(dim=-1)
-    density = torch.where(width > 0, weights / width.clamp_min(tiny), 0)
-    lower, upper = edges[..., :-1] - distance, edges[..., 1:] + distance
-    middles = 0.5 * (wide[..., 1:] + wide[..., :-1])[..., None]
-    covered = (lower[..., None, :] <= middles) & (middles < upper[..., None, :])
-    new = torch.where(covered, density[..., None, :], 0).amax(-1) * wide.diff(dim=-1)
-    return new * (weights.sum(-1, keepdim=True) / new.sum(-1, keepdim=True).clamp_min(tiny))
-
-
-@torch.no_grad()
-def blur(edges: Tensor, weights: Tensor, half_width: float) -> tuple[Tensor, Tensor]:
-    """The density averaged over a window of `half_width` to either side: piecewise linear (Zip-NeRF, section 3).
-
-    Returns:
-        Knots (..., 2 S + 2), ascending, and the density (..., 2 S + 2) there. It integrates to the weights' sum.
-    """
-    edges, weights = edges.double(), weights.double()
-    knots = torch.cat([edges - half_width, edges + half_width], -1).sort(-1).values
-    mass = torch.nn.functional.pad(weights.cumsum(-1), (1, 0))
-    above, below = (_interpolate(edges, mass, knots + side) for side in (half_width, -half_width))
-    return knots, (above - below) / (2 * half_width)
 
 
 @torch.no_grad()

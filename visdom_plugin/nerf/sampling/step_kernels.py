@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 
 RAYS_PER_PIECE = 128
 LEAST_WEIGHT = 1e-12  # so that a ray that meets nothing is sampled evenly over its intervals
@@ -38,7 +38,7 @@ def run(kernel, columns: int, arrays: tuple[Tensor, ...], *scalars: float) -> Te
         for x in arrays
     ]
     out = np.empty((len(flat[0]), columns), flat[0].dtype)
-    spread(kernel, len(out), RAYS_PER_PIECE, *flat, *scalars, out)
+    parallel_for(kernel, len(out), RAYS_PER_PIECE, *flat, *scalars, out)
     return torch.from_numpy(out).reshape(*lead, columns)
 
 
@@ -93,35 +93,6 @@ def resample_blurred(begin, end, edges, weights, at, half_width, out):
                 running[k] = value if sign < 0 else (value - running[k]) / (2 * half_width)
         for k in range(points - 1):
             out[ray, k] = running[k + 1] - running[k]
-
-
-@kernel(error_model="numpy")
-def dilate(begin, end, edges, weights, wide, distance, out):
-    """The intervals that reach a point, widened by the distance, are neighbours: two fingers bound them."""
-    n = weights.shape[1]
-    density = np.empty(n)
-    for ray in range(begin, end):
-        old, new = 0.0, 0.0
-        for i in range(n):
-            width = np.float64(edges[ray, i + 1]) - edges[ray, i]
-            density[i] = weights[ray, i] / width if width > 0 else 0.0
-            old += weights[ray, i]
-        first, behind = 0, 0
-        for k in range(wide.shape[1] - 1):
-            middle = 0.5 * (np.float64(wide[ray, k]) + wide[ray, k + 1])
-            while first < n and edges[ray, first + 1] + distance <= middle:
-                first += 1
-            while behind < n and edges[ray, behind] - distance <= middle:
-                behind += 1
-            most = 0.0
-            for i in range(first, behind):
-                most = max(most, density[i])
-            value = most * (np.float64(wide[ray, k + 1]) - wide[ray, k])
-            out[ray, k] = value
-            new += value
-        scale = old / new if new > 0 else 0.0
-        for k in range(wide.shape[1] - 1):
-            out[ray, k] *= scale
 
 
 @kernel(error_model="numpy")

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.render import Render
 from visdom_plugin.splat.cpu import blending, projection
@@ -85,7 +85,7 @@ class _Project(torch.autograd.Function):
         n, dtype = len(means), arrays[0].dtype
         means2d, splats, extents = np.empty((n, 2), dtype), np.empty((n, 8), dtype), np.empty((n, 3), dtype)
         radii = np.empty((n, 2), np.int32)
-        spread(
+        parallel_for(
             projection.project, n, GAUSSIANS_PER_PIECE, *arrays, degree, camera, width, height,
             means2d, splats, extents, radii,
         )  # fmt: skip
@@ -102,7 +102,7 @@ class _Project(torch.autograd.Function):
         g_means, g_log_scales, g_quaternions, g_sh = (np.empty_like(x) for x in arrays)
         g_opacity_logits = np.empty(len(g_means), g_means.dtype)
         gradients = (g_means, g_log_scales, g_quaternions, g_opacity_logits, g_sh)
-        spread(
+        parallel_for(
             projection.project_backward, len(g_means), GAUSSIANS_PER_PIECE, *arrays, *ctx.rest,
             *_arrays(g_means2d, g_splats), *gradients,
         )  # fmt: skip
@@ -118,7 +118,7 @@ class _Blend(torch.autograd.Function):
         rgb = np.empty((*size, 3), dtype)
         alpha, depth, transmittance = (np.empty(size, dtype) for _ in range(3))
         last = np.empty(size, np.int32)
-        spread(
+        parallel_for(
             blending.blend, tiles.count, TILES_PER_PIECE, tiles.starts, tiles.gaussians, tiles.columns, *arrays,
             rgb, alpha, depth, transmittance, last,
         )  # fmt: skip
@@ -135,12 +135,12 @@ class _Blend(torch.autograd.Function):
         outer = _arrays(g_rgb, g_alpha, g_depth)
         drawn_starts = blending.drawn_starts_of(last, tiles.columns, tiles.count)
         sums = np.empty((drawn_starts[-1], blending.SUMS), alpha.dtype)
-        spread(
+        parallel_for(
             blending.blend_backward, tiles.count, TILES_PER_PIECE, tiles.starts, tiles.gaussians, tiles.columns,
             *inputs, alpha, depth, ctx.transmittance, last, *outer, drawn_starts, sums,
         )  # fmt: skip
         g_means2d, g_splats = np.empty_like(inputs[0]), np.empty_like(inputs[1])
-        spread(
+        parallel_for(
             blending.gather, len(g_means2d), GAUSSIANS_PER_PIECE, tiles.offsets, tiles.slot_tiles,
             tiles.slot_places, tiles.starts, drawn_starts, sums, g_means2d, g_splats,
         )  # fmt: skip

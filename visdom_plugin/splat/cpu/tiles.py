@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.parallel import spread
+from visdom_plugin.compute.parallel import parallel_for
 
 TILE = 16
 """Edge of a tile in pixels."""
@@ -27,11 +27,11 @@ class Tiles:
         self.count = self.columns * self.rows
         self.offsets = np.zeros(n + 1, np.int64)
         shape = (means2d, splats, extents, self.columns, self.rows)
-        spread(_count, n, 2048, *shape, self.offsets)
+        parallel_for(_count, n, 2048, *shape, self.offsets)
         np.cumsum(self.offsets, out=self.offsets)
         total = int(self.offsets[-1])
         self.slot_tiles = np.empty(total, np.int32)
-        spread(_list, n, 2048, *shape, self.offsets, self.slot_tiles)
+        parallel_for(_list, n, 2048, *shape, self.offsets, self.slot_tiles)
         self.starts = np.zeros(self.count + 1, np.int64)
         self.gaussians = np.empty(total, np.int32)
         self.slot_places = np.empty(total, np.int64)
