@@ -16,7 +16,7 @@ def composite_target(
     alpha: Tensor | None = None,
     mask_known: bool | Tensor | None = None,
 ) -> Tensor:
-    """What a render on `background` should look like: the photograph inside the mask, background outside.
+    """The image that a render on `background` is compared with: photograph inside the mask, background outside.
 
     Where the mask is unknown the render's own opacity takes its place, as a constant: the target then asks for
     the photograph's colour in whatever is there and leaves open whether anything is, so that the photograph's
@@ -30,6 +30,8 @@ def composite_target(
         mask_known: (...) bool, or one for all; None means it is known everywhere.
     """
     if mask_known is not None and mask_known is not True:
+        if alpha is None:
+            raise ValueError("where a mask is unknown, the target needs the render's alpha")
         known = torch.as_tensor(mask_known, device=mask.device)
         mask = torch.where(known, mask, alpha.detach())
     return image * mask[..., None] + background * (1 - mask[..., None])

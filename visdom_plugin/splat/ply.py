@@ -74,8 +74,9 @@ def read_ply(path: str | Path, origin: Tensor | None = None) -> Gaussians:
             todo="fetch or export the file again",
         )
     rows = np.frombuffer(data, dtype, count, start)
-    n_rest = sum(name.startswith("f_rest_") for name in dtype.names)
-    missing = [name for name in _names(n_rest) if name not in dtype.names and name not in ("nx", "ny", "nz")]
+    held = dtype.names or ()
+    n_rest = sum(name.startswith("f_rest_") for name in held)
+    missing = [name for name in _names(n_rest) if name not in held and name not in ("nx", "ny", "nz")]
     if missing or n_rest not in _REST_OF_DEGREE:
         what = f"lacks {list_some(missing, 6)}" if missing else f"has {n_rest} f_rest properties"
         raise SceneError(
@@ -130,7 +131,8 @@ def _parse_header(data: bytes, path: Path) -> tuple[int, np.dtype, int]:
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     if ["format", "binary_little_endian", "1.0"] not in lines:
         raise fault("the point cloud is not in binary little endian format")
-    count, fields, element = -1, [], None
+    count, element = -1, None
+    fields: list[tuple[str, str]] = []
     for words in lines:
         if words[:1] == ["element"] and len(words) == 3:
             if element is None and words[1] != "vertex":

@@ -30,7 +30,7 @@ def _level(points: Tensor, table: Tensor, layout: HashLayout, level: int) -> Ten
     cell = position.floor().clamp(max=resolution - 1)
     fraction = position - cell
     cell = cell.long()
-    total = 0
+    total = table.new_zeros(())
     for corner in range(8):
         bits = [(corner >> axis) & 1 for axis in range(3)]
         x, y, z = (cell[..., axis] + bits[axis] for axis in range(3))
@@ -38,7 +38,7 @@ def _level(points: Tensor, table: Tensor, layout: HashLayout, level: int) -> Ten
             row = x + (resolution + 1) * (y + (resolution + 1) * z)
         else:
             row = ((x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])) & BITS & (layout.sizes[level] - 1)
-        weight = 1
+        weight = fraction.new_ones(())
         for axis in range(3):
             weight = weight * (fraction[..., axis] if bits[axis] else 1 - fraction[..., axis])
         # index_select, since its gradient is faster than that of indexing or of an embedding.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -33,7 +35,7 @@ def encode_harmonics(directions: Tensor) -> Tensor:
 def _harmonics_torch(directions: Tensor) -> Tensor:
     """The kernel's own lines, each on all directions (N, 3) at once."""
     out = directions.new_empty(16, len(directions))
-    basis.py_func(3, *directions.unbind(-1), out)
+    inspect.unwrap(basis)(3, *directions.unbind(-1), out)
     return out.T
 
 

@@ -105,9 +105,11 @@ class OccupancyGrid:
             near, far: (n,) float32 their bounds.
         """
         grid = torch.zeros(self.reachable.shape, dtype=torch.bool)
-        rays = [x.detach().float().cpu().contiguous().numpy() for x in (origins, directions, near, far)]
+        o, d, low, high = (
+            x.detach().float().cpu().contiguous().numpy() for x in (origins, directions, near, far)
+        )
         half_cell = np.float32(self.half_side / self.resolution)
-        _touch(*rays, half_cell, grid.numpy(), np.float32(self.half_side))
+        _touch(o, d, low, high, half_cell, grid.numpy(), np.float32(self.half_side))
         grown = torch.nn.functional.max_pool3d(grid[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
         self.reachable = grown.to(self.reachable.device)
         self.occupied = self.occupied & self.reachable
@@ -227,8 +229,8 @@ def march(
     offsets = np.concatenate([[0], np.cumsum(counts)])
     starts, ray = np.empty(offsets[-1], np.float32), np.empty(offsets[-1], np.int64)
     parallel_for(_fill, len(origins), 128, *world, offsets, starts, ray)
-    starts, ray = torch.from_numpy(starts), torch.from_numpy(ray)
-    return PackedSamples(torch.from_numpy(offsets), ray, starts, starts + step[ray])
+    begins, of = torch.from_numpy(starts), torch.from_numpy(ray)
+    return PackedSamples(torch.from_numpy(offsets), of, begins, begins + step[of])
 
 
 def select(samples: PackedSamples, kept: Tensor) -> PackedSamples:
