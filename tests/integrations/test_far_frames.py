@@ -10,7 +10,7 @@ from visdom_plugin.geometry.cameras import Cameras, rays_of
 from visdom_plugin.geometry.local_frame import local_origin
 from visdom_plugin.integrations.gsplat import VisDomStrategy
 from visdom_plugin.integrations.nerfacc import confine, ray_limits
-from visdom_plugin.integrations.nerfstudio.frame import frame_of
+from visdom_plugin.integrations.nerfstudio.frame import similarity_of
 from visdom_plugin.integrations.nerfstudio.rays import bound_model_rays
 
 from ..hull.balls import ring
@@ -36,7 +36,7 @@ def pixels() -> torch.Tensor:
 def test_nerfstudios_rays_are_bounded_alike(far):
     found = []
     for cameras, hull in (place(0), place(far)):
-        frame, hook = frame_of(cameras), VisDomSampler(hull, cameras=cameras)
+        frame, hook = similarity_of(cameras), VisDomSampler(hull, cameras=cameras)
         poses = frame.poses_to_model(cameras)
         rays = rays_of(cameras, pixels())
         directions = (rays.directions @ frame.transform[:, :3].mT).float()
