@@ -7,6 +7,7 @@ these alone, reads their pixels and brings everything to the wanted size.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
@@ -104,7 +105,12 @@ def open_capture(capture: Capture, request: Request) -> Scene:
         **capture.source,
         "hashes": {**split.hashes, **hash_parts(train)},
     }
-    notes = (f"layout {capture.layout}: {split.rule}", *capture.notes, *_note_soft(loaded))
+    notes = (
+        f"layout {capture.layout}: {split.rule}",
+        *capture.notes,
+        *_note_soft(loaded),
+        *_note_remarks(loaded),
+    )
     cloud = None
     if capture.points_file is not None:
         cloud = partial(_read_points, capture.root, capture.points_file, request.allow_outside)
@@ -201,6 +207,14 @@ def _note_soft(loaded: Sequence[LoadedView]) -> list[str]:
     return [f"soft masks: {mean:.1%} of their pixels are neither black nor white, cut at one half"] * (
         mean > 1e-3
     )
+
+
+def _note_remarks(loaded: Sequence[LoadedView]) -> list[str]:
+    counts = Counter(remark for view in loaded for remark in view.remarks)
+    notes = [f"{count} of {len(loaded)} training views: {remark}" for remark, count in counts.items()]
+    for note in notes:
+        log.warning("%s", note)
+    return notes
 
 
 def _warn_inverted(views: Views) -> None:

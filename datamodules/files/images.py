@@ -1,24 +1,38 @@
 """Photographs, masks and depth maps from files: header checks first, then decoding and exact downscaling.
 
-Only PNG and JPEG are read. The size is taken from the header and compared with what the camera asks for
-before a pixel is decoded, and the file is checked for its end: the decoders underneath fill what is missing
-with grey and say nothing.
+The size is taken from the header and compared with what the camera asks for before a pixel is decoded. PNG and
+JPEG are decoded by OpenCV, the other formats by Pillow.
 """
 
 from __future__ import annotations
 
 import io
+from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 import numpy as np
-from PIL.JpegImagePlugin import JpegImageFile
-from PIL.PngImagePlugin import PngImageFile
+from PIL import Image
+from PIL.ImageFile import ImageFile
 
 from datamodules.files.paths import read_plain
 from visdom_plugin.errors import SceneError
 
 MAX_PIXELS = 2**28
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".heic", ".heif")
+"""Of the files of these formats, in lower case; PNG first, as masks are looked for in this order."""
+_MARKS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
+"""How files end of the formats that OpenCV decodes; it fills what is missing with grey and says nothing."""
+_PLUGINS = {
+    "PNG": ("PIL.PngImagePlugin", "PngImageFile"),
+    "JPEG": ("PIL.JpegImagePlugin", "JpegImageFile"),
+    "WEBP": ("PIL.WebPImagePlugin", "WebPImageFile"),
+    "TIFF": ("PIL.TiffImagePlugin", "TiffImageFile"),
+    "BMP": ("PIL.BmpImagePlugin", "BmpImageFile"),
+    "AVIF": ("PIL.AvifImagePlugin", "AvifImageFile"),
+    "HEIC": ("pillow_heif", "HeifImageFile"),
+}
+_ORIENTATION = 0x0112
 
 
 def read_file(path: Path) -> bytes:
@@ -48,50 +62,70 @@ class Header(NamedTuple):
     """Width and height in pixels, as stored."""
     alpha: bool
     """Whether it promises transparency: an alpha channel, a transparent colour, a palette's transparency."""
+    orientation: int = 1
+    """EXIF's tag, 1 to 8: how a viewer turns the stored pixels. TIFF is decoded upright, so it has 1."""
 
 
 def read_header(data: bytes, path: Path) -> Header:
-    """The header of a complete PNG or JPEG; no pixel is decoded.
+    """The header of a complete image file; no pixel is decoded.
 
     Raises:
-        SceneError: another format, a damaged header or chunk, or a file that stops before its end.
+        SceneError: a format that is not read, a damaged header or chunk, or a file that stops before its end.
     """
-    png = data.startswith(b"\x89PNG\r\n\x1a\n")
-    if not png and not data.startswith(b"\xff\xd8"):
-        raise SceneError(
-            "the file is neither PNG nor JPEG" if data else "the file is empty",
-            where=path,
-            cause="another format behind this extension, or an interrupted copy",
-            todo="convert it to PNG or JPEG, or copy it again",
-        )
-    stream = io.BytesIO(data)
+    kind = _kind(data, path)
     try:
-        image = (PngImageFile if png else JpegImageFile)(stream)
-        width, height = image.size
-        complete = data.rfind(b"IEND\xaeB`\x82" if png else b"\xff\xd9") >= stream.tell()
-        if png:
+        image, end = _open(data, kind, path)
+        complete = kind not in _MARKS or data.rfind(_MARKS[kind]) >= end
+        if kind == "PNG":
             image.verify()  # walks the chunks to the last one and compares their checksums
+        exif = Image.Image.getexif(image) if kind != "TIFF" else {}  # PngImageFile's own would decode
+        orientation = exif.get(_ORIENTATION, 1)
+    except SceneError:
+        raise
     except Exception as error:  # Pillow raises whatever it comes across
-        _damaged(
-            path, f"the {'PNG' if png else 'JPEG'} is damaged, or stops before its end: {str(error)[:120]}"
-        )
+        _damaged(path, f"the {kind} is damaged, or stops before its end: {str(error)[:120]}")
     if not complete:
-        _damaged(path, f"the {'PNG' if png else 'JPEG'} stops before its end")
+        _damaged(path, f"the {kind} stops before its end")
+    width, height = image.size
+    most = MAX_PIXELS
     # Deflate makes at most 1032 bytes of one, and a JPEG's block of 8 x 8 pixels takes at least one bit: a
     # larger claim is a bomb, or a damaged header.
-    most = len(data) * (8 * 1032 // max(1, data[24] * len(image.getbands())) if png else 512)
-    if not 0 < width * height <= min(MAX_PIXELS, most):
+    if kind == "PNG":
+        most = min(most, len(data) * 8 * 1032 // max(1, data[24] * len(image.getbands())))
+    elif kind == "JPEG":
+        most = min(most, len(data) * 512)
+    if not 0 < width * height <= most:
         _damaged(path, f"the image claims to be {width} x {height} but holds {len(data)} bytes")
     alpha = "transparency" in image.info or image.mode in ("LA", "PA", "RGBA")
-    return Header((width, height), alpha)
+    return Header((width, height), alpha, orientation if orientation in range(1, 9) else 1)
+
+
+def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """(H, W, ...) pixels as a viewer shows them that follows EXIF's orientation tag, 1 to 8."""
+    if orientation in (5, 6, 7, 8):
+        pixels = np.swapaxes(pixels, 0, 1)
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    return np.ascontiguousarray(pixels)
+
+
+def undo_turn(orientation: int) -> int:
+    """The tag that turns back what another one turned."""
+    return {6: 8, 8: 6}.get(orientation, orientation)
 
 
 def decode_photograph(data: bytes, path: Path) -> np.ndarray:
     """(H, W, 3) uint8 RGB, as stored: EXIF orientation is ignored, as COLMAP does; alpha is dropped."""
     import cv2
 
-    image = _decode(data, path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    if _kind(data, path) in _MARKS:
+        image = _decode(data, path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    image = decode_any(data, path)
+    image = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+    return np.repeat(image[..., None], 3, -1) if image.ndim == 2 else np.ascontiguousarray(image[..., 2::-1])
 
 
 def decode_any(data: bytes, path: Path) -> np.ndarray:
@@ -101,11 +135,31 @@ def decode_any(data: bytes, path: Path) -> np.ndarray:
     """
     import cv2
 
-    image = _decode(data, path, cv2.IMREAD_UNCHANGED)
-    if image.ndim == 2 and image.dtype == np.uint8 and read_header(data, path).alpha:
+    kind = _kind(data, path)
+    if kind in _MARKS:
+        stored = _decode(data, path, cv2.IMREAD_UNCHANGED)
         # OpenCV passes over the transparent level of a grey picture.
-        return np.asarray(PngImageFile(io.BytesIO(data)).convert("LA"))
-    return image
+        if stored.ndim == 3 or stored.dtype != np.uint8 or not read_header(data, path).alpha:
+            return stored
+    try:
+        image: Image.Image = _open(data, kind, path)[0]
+        image.load()
+        if image.mode.startswith("I;16"):
+            return np.asarray(image).astype(np.uint16)
+        if image.mode not in ("L", "LA", "RGB", "RGBA"):
+            grey = image.mode in ("1", "L")
+            clear = "transparency" in image.info or image.mode in ("PA", "La", "RGBa")
+            image = image.convert("L" if grey and not clear else "RGBA" if clear else "RGB")
+        elif "transparency" in image.info:
+            image = image.convert("LA" if image.mode == "L" else "RGBA")
+    except SceneError:
+        raise
+    except Exception as error:  # Pillow raises whatever it comes across
+        _damaged(path, f"the {kind} cannot be decoded: {str(error)[:120]}")
+    pixels = np.asarray(image)
+    if pixels.ndim == 3 and pixels.shape[2] >= 3:
+        pixels = pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
+    return np.ascontiguousarray(pixels)
 
 
 def decode_depth(data: bytes, path: Path) -> np.ndarray:
@@ -162,6 +216,44 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
     if image is None:
         _damaged(path, "the image cannot be decoded")
     return image
+
+
+def _kind(data: bytes, path: Path) -> str:
+    """The format, by the file's first bytes."""
+    brand = data[8:12] if data[4:8] == b"ftyp" else b""
+    for kind, fits in (
+        ("PNG", data.startswith(b"\x89PNG\r\n\x1a\n")),
+        ("JPEG", data.startswith(b"\xff\xd8")),
+        ("WEBP", data.startswith(b"RIFF") and data[8:12] == b"WEBP"),
+        ("TIFF", data.startswith((b"II*\0", b"MM\0*"))),
+        ("BMP", data.startswith(b"BM")),
+        ("AVIF", brand in (b"avif", b"avis")),
+        ("HEIC", brand in (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")),
+    ):
+        if fits:
+            return kind
+    raise SceneError(
+        f"the file is none of {', '.join(_PLUGINS)}" if data else "the file is empty",
+        where=path,
+        cause="another format behind this extension, or an interrupted copy",
+        todo="convert it to PNG or JPEG, or copy it again",
+    )
+
+
+def _open(data: bytes, kind: str, path: Path) -> tuple[ImageFile, int]:
+    """The file as Pillow's plugin opens it, without its limit on sizes, and how far its header reaches."""
+    module, name = _PLUGINS[kind]
+    try:
+        plugin = getattr(import_module(module), name)
+    except ImportError as error:
+        extra = "'visdom-plugin[heic]'" if kind == "HEIC" else "'pillow>=11.3'"
+        raise SceneError(
+            f"the file is {kind}, which is not read here yet",
+            where=path,
+            todo=f"pip install {extra}, or convert it to PNG or JPEG",
+        ) from error
+    stream = io.BytesIO(data)
+    return plugin(stream), stream.tell()
 
 
 def _damaged(path: Path, what: str) -> NoReturn:

@@ -17,6 +17,7 @@ from visdom_plugin.errors import SceneError
 
 MOST_ENLARGED = 10
 """A mask more than this many times wider than its image is refused before it is decoded."""
+_NEARLY_FULL = 0.93
 _SOFT = (0.02, 0.98)
 _AGREED = 0.01
 
@@ -31,10 +32,15 @@ class Mask(NamedTuple):
 
 
 def fits(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes (width, height) are one picture at two resolutions, the smaller one's sides rounded."""
+    """Whether two sizes (width, height) are one picture at two resolutions, the smaller one's sides rounded.
+
+    Nobody makes a copy a few per cent smaller: such sizes are those of a picture undistorted or cropped.
+    """
     small, large = sorted((size, other))
     low = max((s - 0.5) / o for s, o in zip(small, large, strict=True))
     high = min((s + 0.5) / o for s, o in zip(small, large, strict=True))
+    if size != other and high > _NEARLY_FULL:
+        return False
     return low <= high and max(size) <= MOST_ENLARGED * max(other)
 
 

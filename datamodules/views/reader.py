@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -19,9 +20,12 @@ from datamodules.files import images, masks
 from datamodules.files.paths import inside, printable
 from datamodules.files.undistort import Distortion, undistort
 from datamodules.request import Request
+from datamodules.views import orientation
 from visdom_plugin.errors import SceneError
 
 _T = TypeVar("_T")
+_LOOKED_AT = 6
+"""Views whose pixels decide whether masks are turned."""
 _VERSION = 1
 """Raised when other pixels are made of the same files."""
 
@@ -33,6 +37,9 @@ class _Job(NamedTuple):
     """How much smaller the photographs' files are than the cameras say."""
     downscale: float
     request: Request
+
+
+_ChooseTurns = Callable[[], tuple[int, bool]]
 
 
 class ViewReader:
@@ -52,6 +59,8 @@ class ViewReader:
         cameras = calibration.cameras
         self._full = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
         self._K = cameras.intrinsics.numpy()
+        self._lock = threading.Lock()
+        self._way: tuple[int, bool] | None = None
 
     def read(self, i: int) -> LoadedView:
         """Decodes one view.
@@ -60,7 +69,9 @@ class ViewReader:
             SceneError: for everything wrong with its files.
         """
         with self._named(i):
-            return _read_view(self._job, self._files[i], self._full[i], self._K[i], self._distortions[i])
+            return _read_view(
+                self._job, self._files[i], self._full[i], self._K[i], self._distortions[i], self._choose_turns
+            )
 
     def inspect(self, i: int) -> InspectedView:
         """Checks one view's files to their last byte, and that its mask is not empty, without decoding its
@@ -72,6 +83,21 @@ class ViewReader:
         with self._named(i):
             plan = repr((self._full[i], self._K[i].tolist(), self._distortions[i], *self._job[2:4]))
             return _inspect_view(self._job, self._files[i], self._full[i], plan)
+
+    def _choose_turns(self) -> tuple[int, bool]:
+        """For masks whose size fits their photograph turned and not: which way most of them are, and whether
+        that is clear."""
+        with self._lock:
+            if self._way is None:
+                scores: list[list[float]] = []
+                for file, full in zip(self._files, self._full, strict=True):
+                    if file.mask is not None and len(scores) < _LOOKED_AT:
+                        with suppress(SceneError):  # told of the view when it is read
+                            scores += _score_turns(
+                                self._job, file.mask, _open_photograph(self._job, file, full)
+                            )
+                self._way = orientation.choose(scores) if scores else (0, False)
+            return self._way
 
     @contextmanager
     def _named(self, i: int) -> Iterator[None]:
@@ -95,8 +121,13 @@ class _Photograph(NamedTuple):
     path: Path
     data: bytes
     size: tuple[int, int]
+    """Width and height as they are used: turned upright where `turned`."""
     alpha: bool
     """Whether it promises transparency."""
+    orientation: int
+    """EXIF's tag."""
+    turned: bool
+    """Whether the pixels are turned by the tag, because the camera's size demands it."""
     target: tuple[int, int]
     """Width and height that are wanted."""
 
@@ -104,23 +135,31 @@ class _Photograph(NamedTuple):
 def _open_photograph(job: _Job, file: ViewFiles, full: tuple[int, int]) -> _Photograph:
     path = inside(job.root, file.image, outside=job.request.allow_outside)
     data = images.read_file(path)
-    size, alpha = images.read_header(data, path)
-    _check_size(size, full, job.factor, path)
+    size, alpha, orientation = images.read_header(data, path)
+    upright = size[::-1] if orientation >= 5 else size
+    turned = upright != size and not _fits_camera(size, full, job.factor)
+    if turned and _fits_camera(upright, full, job.factor):
+        size = upright
+    else:
+        turned = False
+        _check_size(size, full, job.factor, path)
     width, height = (s if job.factor > 1 else max(1, round(s / job.downscale)) for s in size)
-    return _Photograph(path, data, size, alpha, (width, height))
+    return _Photograph(path, data, size, alpha, orientation, turned, (width, height))
 
 
 def _inspect_view(job: _Job, file: ViewFiles, full: tuple[int, int], plan: str) -> InspectedView:
     photo = _open_photograph(job, file, full)
     state = hashlib.sha256(f"{_VERSION} {plan} {job.request.mask_source}".encode())
     state.update(photo.data)
+    if photo.orientation != 1:
+        state.update(b"turned by its tag where sizes or outlines ask for it")
     outside = job.request.allow_outside
     for relative in (file.mask, file.ignore, file.excluded, file.depth):
         if relative is not None and (other := inside(job.root, relative, outside=outside)).is_file():
             state.update(hashlib.sha256(images.read_file(other)).digest())
     masked = photo.alpha and job.request.mask_source != "folder"
     if file.mask is not None or (masked and job.request.allow_missing_masks):
-        soft, mask_path = _read_mask(job, file, photo)
+        soft, mask_path, _ = _read_mask(job, file, photo, lambda: (0, False))
         masked = soft is not None
         if soft is not None:
             masks.refuse_empty(_resize(soft, *photo.target) > 0.5, float(soft.max()), mask_path)
@@ -128,7 +167,7 @@ def _inspect_view(job: _Job, file: ViewFiles, full: tuple[int, int], plan: str) 
         _no_mask(job, file, photo.path)
     for relative in (file.ignore, file.excluded):
         if relative is not None:
-            _read_other(job, relative, photo.size, "mask of ignored pixels")
+            _open_other(job, relative, photo, "mask of ignored pixels")
     depth = None if file.depth is None else inside(job.root, file.depth, outside=outside)
     return InspectedView(
         size=photo.target,
@@ -140,16 +179,26 @@ def _inspect_view(job: _Job, file: ViewFiles, full: tuple[int, int], plan: str) 
 
 
 def _read_view(
-    job: _Job, file: ViewFiles, full: tuple[int, int], K: np.ndarray, distortion: Distortion | None
+    job: _Job,
+    file: ViewFiles,
+    full: tuple[int, int],
+    K: np.ndarray,
+    distortion: Distortion | None,
+    choose_turns: _ChooseTurns,
 ) -> LoadedView:
     photo = _open_photograph(job, file, full)
-    opacity, mask_path = _read_mask(job, file, photo)
+    opacity, mask_path, remarks = _read_mask(job, file, photo, choose_turns)
+    if photo.turned:
+        remarks = (
+            f"turned upright by EXIF orientation {photo.orientation}, as the camera's size asks",
+            *remarks,
+        )
     masked = opacity is not None
     if not masked and not job.request.allow_missing_masks:
         _no_mask(job, file, photo.path)
     soft = np.ones((1, 1), np.float32) if opacity is None else opacity
-    image = images.decode_photograph(photo.data, photo.path)
-    unknown = _read_ignored(job, file, photo.size)
+    image = _decode_turned(photo)
+    unknown = _read_ignored(job, file, photo, choose_turns)
     if distortion is not None:
         scaled = K * np.array([[photo.size[0] / full[0]], [photo.size[1] / full[1]], [1.0]])
         flat = undistort(scaled, distortion, image, _resize(soft, *photo.size), unknown, where=photo.path)
@@ -176,18 +225,32 @@ def _read_view(
         depth=_read_depth(job, file, full, photo.target),
         masked=masked,
         soft=masks.soft_share(soft) if masked else 0.0,
+        remarks=remarks,
     )
 
 
+def _fits_camera(size: tuple[int, int], full: tuple[int, int], factor: float) -> bool:
+    """Whether a photograph is what its camera saw: at the size expected, or evenly resized as a whole."""
+    near = factor if factor > 1 else 0
+    exact = all(abs(s * factor - f) <= near for s, f in zip(size, full, strict=True))
+    return exact or masks.fits(size, full)
+
+
 def _check_size(size: tuple[int, int], full: tuple[int, int], factor: float, path: Path) -> None:
-    if all(abs(s * factor - f) <= (factor if factor > 1 else 0) for s, f in zip(size, full, strict=True)):
+    if _fits_camera(size, full, factor):
         return
     small = f", which at 1/{factor:g} is {full[0] / factor:g} x {full[1] / factor:g}" if factor > 1 else ""
+    sideways = _fits_camera(size[::-1], full, factor)
     raise SceneError(
         f"the image is {size[0]} x {size[1]} but its camera says {full[0]} x {full[1]}{small}",
         where=path,
-        cause="the images were resized, cropped or rotated after the poses were estimated",
-        todo="put the images there that the model was made from; smaller copies go to images_<F>",
+        cause="the image was turned by a quarter after the poses were estimated, as programs do that follow the "
+        "orientation tag of EXIF and drop it"
+        if sideways
+        else "the images were undistorted, cropped or unevenly resized after the poses were estimated",
+        todo="turn it back by a quarter, or put the images there that the model was made from"
+        if sideways
+        else "put the images there that the model was made from; smaller copies go to images_<F>",
     )
 
 
@@ -211,34 +274,90 @@ def _no_mask(job: _Job, file: ViewFiles, path: Path) -> None:
     )
 
 
-def _read_mask(job: _Job, file: ViewFiles, photo: _Photograph) -> tuple[np.ndarray | None, Path]:
-    """(H, W) float32 opacity at the file's own size, and the file; None where there is no mask."""
+def _score_turns(job: _Job, mask: str, photo: _Photograph) -> list[list[float]]:
+    """`outline_contrast` in each way that a mask's size allows, as a row; no row where there is but one way."""
+    other = _open_other(job, mask, photo, "mask")
+    if len(other.turns) == 1:
+        return []
+    image, opacity = _decode_turned(photo), masks.decode_mask(other.data, other.path).opacity
+    turned = [orientation.apply(opacity, turns) for turns in other.turns]
+    return [[orientation.outline_contrast(image, way) for way in turned]]
+
+
+def _decode_turned(photo: _Photograph) -> np.ndarray:
+    image = images.decode_photograph(photo.data, photo.path)
+    return images.turn(image, photo.orientation) if photo.turned else image
+
+
+def _read_mask(
+    job: _Job, file: ViewFiles, photo: _Photograph, choose_turns: _ChooseTurns
+) -> tuple[np.ndarray | None, Path, tuple[str, ...]]:
+    """(H, W) float32 opacity at the file's own size, the file, and remarks; None where there is no mask."""
     source, alpha = job.request.mask_source, None
     if photo.alpha and source != "folder":
         alpha = masks.decode_alpha(images.decode_any(photo.data, photo.path))
+        if alpha is not None and photo.turned:
+            alpha = alpha._replace(opacity=images.turn(alpha.opacity, photo.orientation))
     if source == "alpha" or (file.mask is None and source != "folder"):
-        return (None if alpha is None else alpha.opacity), photo.path
+        return (None if alpha is None else alpha.opacity), photo.path, ()
     if file.mask is None:
-        return None, photo.path
-    data, mask_path = _read_other(job, file.mask, photo.size, "mask")
-    found = masks.decode_mask(data, mask_path)
+        return None, photo.path, ()
+    other = _open_other(job, file.mask, photo, "mask")
+    turns, remark = _only_turns(other, photo, choose_turns)
+    found = masks.decode_mask(other.data, other.path)
+    found = found._replace(opacity=orientation.apply(found.opacity, turns))
     if alpha is not None:
-        masks.refuse_two(found, alpha, mask_path, photo.path)
-    return found.opacity, mask_path
+        masks.refuse_two(found, alpha, other.path, photo.path)
+    return found.opacity, other.path, remark
 
 
-def _read_other(job: _Job, relative: str, size: tuple[int, int], what: str) -> tuple[bytes, Path]:
+class _Other(NamedTuple):
+    data: bytes
+    path: Path
+    turns: list[orientation.Turns]
+    """Ways in which it can be turned to fit its photograph."""
+
+
+def _open_other(job: _Job, relative: str, photo: _Photograph, what: str) -> _Other:
     path = inside(job.root, relative, outside=job.request.allow_outside)
     data = images.read_file(path)
-    other = images.read_header(data, path).size
-    if not masks.fits(other, size):
-        raise SceneError(
-            f"the {what} is {other[0]} x {other[1]} but its image is {size[0]} x {size[1]}",
-            where=path,
-            cause=f"the {what} was made of another image, or of a crop of it",
-            todo=f"make the {what} from the image, at any size of the same shape",
+    header = images.read_header(data, path)
+    ways = orientation.possible_turns(photo.orientation, photo.turned, header.orientation)
+    ways = [turns for turns in ways if masks.fits(orientation.turned_size(header.size, turns), photo.size)]
+    if ways:
+        return _Other(data, path, ways)
+    width, height = header.size
+    sideways = masks.fits((height, width), photo.size)
+    raise SceneError(
+        f"the {what} is {width} x {height} but its image is {photo.size[0]} x {photo.size[1]}",
+        where=path,
+        cause=f"the {what} or the image was turned by a quarter, and says nothing of it"
+        if sideways
+        else f"the {what} was made of another image: one cropped, or not undistorted as this one is",
+        todo=f"turn the {what} by a quarter"
+        if sideways
+        else f"make the {what} from the image, at any size of the same shape",
+    )
+
+
+def _only_turns(
+    other: _Other, photo: _Photograph, choose_turns: _ChooseTurns
+) -> tuple[orientation.Turns, tuple[str, ...]]:
+    """The way in which a mask is turned, and what is to be said about it."""
+    way, clear = choose_turns() if len(other.turns) > 1 else (0, True)
+    turns = other.turns[way]
+    if not clear:
+        return turns, (
+            f"photographs with EXIF orientation {photo.orientation}, whose masks may be turned against them: "
+            "neither sizes nor outlines tell; the pixels are taken as they are stored",
         )
-    return data, path
+    if not turns:
+        return turns, ()
+    return turns, (
+        f"masks turned to match their photographs, which have EXIF orientation {photo.orientation}"
+        if photo.orientation > 1
+        else f"masks turned by their EXIF orientation {turns[0]}",
+    )
 
 
 def _resize(soft: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -248,14 +367,18 @@ def _resize(soft: np.ndarray, width: int, height: int) -> np.ndarray:
     return images.shrink_nearest(soft, width, height)
 
 
-def _read_ignored(job: _Job, file: ViewFiles, size: tuple[int, int]) -> np.ndarray | None:
+def _read_ignored(
+    job: _Job, file: ViewFiles, photo: _Photograph, choose_turns: _ChooseTurns
+) -> np.ndarray | None:
     ignore = None
     for relative, black_is_unknown in ((file.ignore, True), (file.excluded, False)):
         if relative is None:
             continue
-        values = masks.decode_mask(*_read_other(job, relative, size, "mask of ignored pixels")).opacity
+        other = _open_other(job, relative, photo, "mask of ignored pixels")
+        turns, _ = _only_turns(other, photo, choose_turns)
+        values = orientation.apply(masks.decode_mask(other.data, other.path).opacity, turns)
         unknown = values <= 0.5 if black_is_unknown else values > 0
-        unknown = _resize(unknown.astype(np.float32), *size) > 0
+        unknown = _resize(unknown.astype(np.float32), *photo.size) > 0
         ignore = unknown if ignore is None else ignore | unknown
     return ignore if ignore is not None and ignore.any() else None
 

@@ -180,7 +180,7 @@ FAULTS = {
     "JPEG cut": (lambda f: _jpeg(f, 0.7), ["stops before its end", "train_001"]),
     "JPEG cut in its header": (lambda f: _jpeg(f, 0.1), ["JPEG", "train_001"]),
     "empty file": (lambda f: (f / "images/train_001.png").write_bytes(b""), ["is empty", "train_001"]),
-    "another format": (lambda f: (f / "images/train_001.png").write_bytes(b"GIF89a"), ["neither PNG nor JPEG"]),
+    "another format": (lambda f: (f / "images/train_001.png").write_bytes(b"GIF89a"), ["none of PNG, JPEG"]),
     "huge image header": (lambda f: _huge_png(f / "images/train_001.png"), ["60000 x 60000", "train_001"]),
     "large mask header": (lambda f: _huge_png(f / "masks/train_001.png", 9600, 7200), ["9600 x 7200"]),
     "8-bit depth": (
