@@ -84,10 +84,10 @@ class Hull:
 
     __hash__ = None  # type: ignore[assignment]
 
-    def relative_to(self, origin) -> Hull:
+    def relative_to(self, origin: np.ndarray | Sequence[float]) -> Hull:
         """The same hull in the frame that has its origin at `origin` (3,), with the same axes; itself for zero."""
-        origin = np.asarray(origin, np.float64)
-        return Hull(self.occupancy, self.bounds - origin, self.summary) if origin.any() else self
+        shift = np.asarray(origin, np.float64)
+        return Hull(self.occupancy, self.bounds - shift, self.summary) if shift.any() else self
 
     @property
     def shape(self) -> tuple[int, int, int]:

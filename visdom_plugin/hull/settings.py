@@ -23,7 +23,8 @@ class HullSettings:
     max_misses: int | None = None
     """Views that may miss, in place of the agreement."""
     kind: Literal["visdom", "traditional", "unit-sphere", "released-go"] = "visdom"
-    """Which hull of the paper's comparison."""
+    """Which hull of the paper's comparison: the visible domain, without K, that inside a ball, or GaussianObject's
+    rule."""
     bounds: Box | None = None
     """Lower and upper corner of the grid in world units, in place of automatic bounds."""
     resolution: int = 256

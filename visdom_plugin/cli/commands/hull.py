@@ -16,45 +16,24 @@ from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.hull.settings import Box
+from visdom_plugin.hull.settings import HullSettings
 
 if TYPE_CHECKING:
     from visdom_plugin.scene import Scene
 
-_DEFAULT = VisibleDomain()
 _UNCOVERED = 0.9
 """Share of a mask below which the hull leaves it uncovered."""
 
 
 @dataclass(frozen=True)
-class Options(FolderOptions):
+class Options(FolderOptions, HullSettings):
     """Carve the visible-domain hull of a scene from its cameras and masks.
 
     Prints what it measured; --out writes the mesh (.ply) or the voxel grid (.npz).
     """
 
-    k: Annotated[int | Literal["n-1", "auto"], tyro.conf.arg(aliases=["-k"])] = _DEFAULT.k
-    """Fewest views that must see a voxel."""
-    agreement: float = _DEFAULT.agreement
-    """Share of the views that see a voxel that must have it inside their mask."""
-    max_misses: int | None = None
-    """Views that may miss, in place of the agreement."""
-    kind: Literal["visdom", "traditional", "unit-sphere", "released-go"] = "visdom"
-    """Which hull: the visible domain, without K, that inside a ball, or GaussianObject's rule."""
-    resolution: int = _DEFAULT.resolution
-    """Voxels along the grid's longest side."""
-    bounds: Box | None = None
-    """Lower and upper corner, six numbers in world units; by default found from cameras and masks."""
-    components: Literal["explain", "drop-small", "all", "largest"] = "explain"
-    """Which connected pieces stay: those that explain foreground of their own, large ones, all, the largest."""
-    min_component_fraction: float = _DEFAULT.min_component_fraction
-    """Pieces below this fraction of the largest are small."""
-    dilate_px: int = 0
-    """Grow the masks by this many pixels first."""
-    sphere_centre: tuple[float, float, float] | None = None
-    """Centre of the ball of --kind unit-sphere, world units."""
-    sphere_radius: float | None = None
-    """Radius of that ball."""
+    k: Annotated[int | Literal["n-1", "auto"], tyro.conf.arg(aliases=["-k"])] = HullSettings.k
+    """K, the fewest views that must see a voxel. n-1: all but one. auto: 3, or 2 where 3 loses more of a mask."""
     inside: bool = False
     """Report and write the smoothest full shape inside the hull that covers as much of the masks, not the hull."""
     out: Path | None = None

@@ -1,4 +1,4 @@
-"""What a check says: one finding per fault."""
+"""Findings of a check: one per fault."""
 
 from __future__ import annotations
 
