@@ -234,7 +234,8 @@ class VisDomGaussianRegularizer:
         index = int(torch.randint(self.config.bank, (), generator=generator))
         if index not in self._bank:
             camera = self.sample_camera(torch.Generator().manual_seed(index))
-            self._bank[index] = camera, depth_and_silhouette(self.hull, camera)[1]
+            silhouette = depth_and_silhouette(self.hull, camera)[1]
+            self._bank[index] = camera.to(self._device), silhouette.to(self._device)
         return self._bank[index]
 
     def after_step(self, gaussians: Any, step: int) -> Tensor | None:
