@@ -6,14 +6,14 @@ import torch
 
 from tests.splat.twin import make_gaussians
 from visdom_plugin.errors import SceneError
-from visdom_plugin.splat.ply import read_ply, write_ply
+from visdom_plugin.splat.ply import read_ply, write_gaussians
 
 
 @pytest.mark.parametrize("n", [0, 1, 50])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_round_trip_is_exact(tmp_path, n, degree):
     gaussians = make_gaussians(n=n, degree=degree, dtype=torch.float32)
-    write_ply(tmp_path / "a.ply", gaussians)
+    write_gaussians(tmp_path / "a.ply", gaussians)
     back = read_ply(tmp_path / "a.ply")
     for name, value in gaussians.tensors().items():
         assert torch.equal(getattr(back, name), value.detach()), name
@@ -23,7 +23,7 @@ def test_round_trip_is_exact(tmp_path, n, degree):
 def test_layout_is_that_of_3dgs(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     gaussians = make_gaussians(n=5, dtype=torch.float32).detach()
-    write_ply(tmp_path / "a.ply", gaussians)
+    write_gaussians(tmp_path / "a.ply", gaussians)
     data = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [*(f"f_rest_{i}" for i in range(45)), "opacity", "scale_0", "scale_1", "scale_2"]
@@ -50,7 +50,7 @@ def test_other_order_types_and_extra_properties_are_read(tmp_path):
 
 def damage(change):
     def broken(tmp_path):
-        write_ply(tmp_path / "a.ply", make_gaussians(n=9, dtype=torch.float32))
+        write_gaussians(tmp_path / "a.ply", make_gaussians(n=9, dtype=torch.float32))
         data = change((tmp_path / "a.ply").read_bytes())
         (tmp_path / "a.ply").write_bytes(data)
         return tmp_path / "a.ply"

@@ -25,7 +25,7 @@ _REST_OF_DEGREE = (0, 9, 24, 45)
 _MAX_HEADER_BYTES = 1 << 16
 
 
-def write_ply(path: str | Path, gaussians: Gaussians, origin: Tensor | None = None) -> None:
+def write_gaussians(path: str | Path, gaussians: Gaussians, origin: Tensor | None = None) -> None:
     """Writes a 3DGS point cloud; the file appears complete or not at all.
 
     Args:

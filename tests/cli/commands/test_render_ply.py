@@ -8,7 +8,7 @@ from datamodules import load
 from tests.splat.twin import make_gaussians
 from visdom_plugin.cli.commands import render
 from visdom_plugin.figures.contact_sheet import read_png, to_bytes
-from visdom_plugin.splat.ply import read_ply, write_ply
+from visdom_plugin.splat.ply import read_ply, write_gaussians
 from visdom_plugin.splat.rasterise import rasterise
 
 SMALL = ["--views", "3", "--downscale", "4", "--device", "cpu", "--format", "png"]
@@ -16,7 +16,7 @@ SMALL = ["--views", "3", "--downscale", "4", "--device", "cpu", "--format", "png
 
 @pytest.fixture
 def cloud(tmp_path):
-    write_ply(tmp_path / "Überall.ply", make_gaussians(n=30, dtype=torch.float32).detach())
+    write_gaussians(tmp_path / "Überall.ply", make_gaussians(n=30, dtype=torch.float32).detach())
     return tmp_path / "Überall.ply"
 
 
@@ -43,7 +43,7 @@ def test_a_video_lies_beside_the_file(cloud):
 def lost(path):
     gaussians = make_gaussians(n=5, dtype=torch.float32).detach()
     gaussians.means[2, 1] = float("nan")
-    write_ply(path, gaussians)
+    write_gaussians(path, gaussians)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
 from visdom_plugin.splat.model import GaussianSet
-from visdom_plugin.splat.ply import write_ply
+from visdom_plugin.splat.ply import write_gaussians
 from visdom_plugin.splat.rasterise import rasterise
 from visdom_plugin.training.protocols import StepOutput, ViewBatch
 
@@ -89,5 +89,5 @@ class GsGo:
 
     def export(self, folder: Path) -> list[Path]:
         path = Path(folder) / "point_cloud.ply"
-        write_ply(path, self.splats.gaussians(), self.origin)
+        write_gaussians(path, self.splats.gaussians(), self.origin)
         return [path]
