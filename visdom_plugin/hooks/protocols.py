@@ -48,6 +48,25 @@ class SamplerHook(Protocol):
 
 
 @runtime_checkable
+class PixelSampler(Protocol):
+    """What a sampler hook may offer besides: to ask once for all training pixels, whose rays never change."""
+
+    def follow_pixels(self, cameras: Cameras) -> None:
+        """Names the training cameras (N,), on the device of the rays; called once, in `setup`."""
+        ...
+
+    def bound_pixels(
+        self, pixels: Tensor, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
+    ) -> RayBounds:
+        """The same as `bound` on `geometry.cameras.rays_of_pixels`, bit for bit on the CPU.
+
+        Args:
+            pixels: (n,) int64 numbers among the cameras' pixels, view by view and row by row.
+        """
+        ...
+
+
+@runtime_checkable
 class SampleFilter(Protocol):
     """What a sampler hook may offer besides: a say about each sample (VaxNeRF, Kondo et al. 2021).
 

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.geometry.cameras import Cameras, rays_of_pixels
 from visdom_plugin.hooks import torch_ops
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.hull import Hull
-from visdom_plugin.hull.queries.raycast import cast
+from visdom_plugin.hull.queries.raycast import Crossing, cast
 
 CAMERA_DISTANCE_HULL_RADII = 10 / 3
 """How far cameras are that nobody told of: about where the object fills half of the picture."""
+
+MOST_PIXELS = 1 << 26
+"""Pixels whose crossings are kept: 600 MB."""
+PIXELS_AT_ONCE = 1 << 18
 
 
 def _limit(value: Tensor | float, like: Tensor) -> Tensor:
@@ -49,6 +53,30 @@ def _epsilon_world(config: SamplerConfig, hull: Hull, cameras: Cameras | None) -
         offsets = cameras.centres.cpu().numpy() - hull.centre
         distance = sum((d @ d) ** 0.5 for d in offsets) / len(cameras)
     return config.epsilon_camera_distances * distance
+
+
+@dataclass
+class _Pixels:
+    """All training pixels, and where their rays meet the hull."""
+
+    cameras: Cameras
+    ends: Tensor
+    """(N,) int64 one past each view's last pixel."""
+    found: Crossing | None = None
+    """(P,) float32, float32 and bool."""
+
+    def crossing(self, hull: Hull) -> Crossing:
+        """Of all pixels; found once."""
+        if self.found is None:
+            parts = []
+            for begin in range(0, int(self.ends[-1]), PIXELS_AT_ONCE):
+                end = min(begin + PIXELS_AT_ONCE, int(self.ends[-1]))
+                flat = torch.arange(begin, end, device=self.ends.device)
+                view = torch.searchsorted(self.ends, flat, right=True)
+                start = self.ends[view] - (self.cameras.width * self.cameras.height)[view]
+                parts.append(cast(hull, *rays_of_pixels(self.cameras, view, flat - start)))
+            self.found = Crossing(*(torch.cat(x) for x in zip(*parts, strict=True)))
+        return self.found
 
 
 class VisDomSampler:
@@ -102,6 +130,7 @@ class VisDomSampler:
                 cause="an empty hull, or an epsilon that is negative, zero or not a number",
                 todo="give a positive epsilon_camera_distances, epsilon_hull_radii or epsilon_world",
             )
+        self._pixels: _Pixels | None = None
         self._number = torch_ops.enter(self)
 
     @property
@@ -151,21 +180,51 @@ class VisDomSampler:
         if half:
             directions = directions.float()
         with torch.no_grad():
-            crossing = cast(self.hull, origins, directions)
-            first = crossing.t_first
-            near, far = (_limit(x, first) for x in (near, far))
-            far = torch.maximum(far, near)
-            last = first if self.config.interval == "first_hit" else crossing.t_last
-            epsilon = self.epsilon_world / directions.norm(dim=-1).to(first)
-            begin, end = torch.maximum(near, first - epsilon), torch.minimum(far, last + epsilon)
-            hit = crossing.hit & (begin < end)
-            if half:
-                rounding = torch.finfo(half).eps
-                begin = torch.maximum(near.to(half), (begin - rounding * begin.abs()).to(half))
-                end = torch.minimum(far.to(half), (end + rounding * end.abs()).to(half))
-                near, far = near.to(half), far.to(half)
-            begin = torch.where(hit, begin, near)
-            end = torch.where(hit, end, far if self.config.missing == "full" else near)
+            return self._limit_band(cast(self.hull, origins, directions), directions, near, far, half)
+
+    def follow_pixels(self, cameras: Cameras) -> None:
+        """Names the training cameras (N,) whose pixels `bound_pixels` is asked about.
+
+        Where they meet the hull is found at the first question, once for all of them, and kept: 9 bytes per pixel.
+        Above `MOST_PIXELS` pixels each question is answered for itself.
+        """
+        ends = (cameras.width * cameras.height).cumsum(0)
+        self._pixels = _Pixels(cameras, ends) if int(ends[-1]) <= MOST_PIXELS else None
+
+    def bound_pixels(
+        self, pixels: Tensor, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
+    ) -> RayBounds:
+        """The same as `bound`, for pixels (n,) of the cameras that `follow_pixels` was told of."""
+        if self._pixels is None:
+            return self.bound(origins, directions, near, far)
+        with torch.no_grad():
+            crossing = self._pixels.crossing(self.hull)
+            found = Crossing(*(x[pixels] for x in crossing))
+            return self._limit_band(found, directions.detach(), near, far, None)
+
+    def _limit_band(
+        self,
+        crossing: Crossing,
+        directions: Tensor,
+        near: Tensor | float,
+        far: Tensor | float,
+        half: torch.dtype | None,
+    ) -> RayBounds:
+        """The band around a crossing, inside [near, far], rounded outwards to half precision if asked for."""
+        first = crossing.t_first
+        near, far = (_limit(x, first) for x in (near, far))
+        far = torch.maximum(far, near)
+        last = first if self.config.interval == "first_hit" else crossing.t_last
+        epsilon = self.epsilon_world / directions.norm(dim=-1).to(first)
+        begin, end = torch.maximum(near, first - epsilon), torch.minimum(far, last + epsilon)
+        hit = crossing.hit & (begin < end)
+        if half:
+            rounding = torch.finfo(half).eps
+            begin = torch.maximum(near.to(half), (begin - rounding * begin.abs()).to(half))
+            end = torch.minimum(far.to(half), (end + rounding * end.abs()).to(half))
+            near, far = near.to(half), far.to(half)
+        begin = torch.where(hit, begin, near)
+        end = torch.where(hit, end, far if self.config.missing == "full" else near)
         return RayBounds(begin, end, hit)
 
     def keep(self, points: Tensor) -> Tensor:

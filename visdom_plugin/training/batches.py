@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.errors import SceneError
-from visdom_plugin.geometry.cameras import pixel_radius, rays_of
+from visdom_plugin.geometry.cameras import pixel_radius, rays_of_pixels
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
 from visdom_plugin.training.protocols import PixelBatch, ViewBatch
@@ -77,16 +77,13 @@ class DataManager:
         view = torch.searchsorted(self._ends, flat, right=True)
         inside = (flat - torch.cat([self._ends.new_zeros(1), self._ends])[view]).to(self.device)
         flat, view = flat.to(self.device), view.to(self.device)
-        cameras = self._cameras[view]
-        uv = torch.stack([inside % cameras.width, inside // cameras.width], -1)
-        rays = rays_of(cameras, (uv + 0.5).to(cameras.intrinsics)[:, None])
         return PixelBatch(
-            rays.origins[:, 0].float(),
-            rays.directions[:, 0].float(),
+            *rays_of_pixels(self._cameras, view, inside),
             self._flat[0][flat].float() / 255,
             self._flat[1][flat].float(),
-            pixel_radius(cameras),
+            pixel_radius(self._cameras[view]),
             None if all(self._mask_known) else torch.tensor(self._mask_known, device=self.device)[view],
+            flat,
         )
 
     def _flatten(self) -> None:

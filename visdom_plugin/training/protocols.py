@@ -41,7 +41,7 @@ class PixelBatch:
     """Pixels drawn evenly over all training views, ignored ones left out."""
 
     origins: Tensor
-    """(n, 3) float32 world frame."""
+    """(n, 3) float32, in the frame of the views."""
     directions: Tensor
     """(n, 3) float32 unit, through the pixels' centres."""
     rgb: Tensor
@@ -52,6 +52,9 @@ class PixelBatch:
     """(n,) float32 radius of each pixel's cone at distance 1."""
     mask_known: Tensor | None = None
     """(n,) bool, False at pixels of views that are good for colour only; None when all masks are known."""
+    pixels: Tensor | None = None
+    """(n,) int64 numbers of the pixels among those of all training views, view by view and row by row; None for
+    rays of anything else."""
 
 
 @dataclass(frozen=True)

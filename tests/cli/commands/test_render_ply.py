@@ -8,6 +8,7 @@ from datamodules import load
 from tests.splat.twin import make_gaussians
 from visdom_plugin.cli.commands import render
 from visdom_plugin.figures.contact_sheet import read_png, to_bytes
+from visdom_plugin.geometry.local_frame import local_origin
 from visdom_plugin.splat.ply import read_ply, write_gaussians
 from visdom_plugin.splat.rasterise import rasterise
 
@@ -33,6 +34,22 @@ def test_pictures_are_those_of_the_rasteriser(cloud, path, count, capsys):
         drawn = rasterise(read_ply(cloud), cameras[i], torch.ones(3)).rgb
         assert np.array_equal(read_png(picture), to_bytes(drawn))
         assert read_png(picture).std() > 1
+
+
+@pytest.mark.parametrize("far", [1e5, 5e6])
+def test_a_cloud_far_from_the_origin_looks_the_same(cloud, far):
+    near = read_ply(cloud)
+    cameras = load(None, views=3, downscale=4, seed=0).train.cameras
+    shift = torch.tensor([far, -far, 0.5 * far], dtype=torch.float64)
+    write_gaussians(cloud, near, shift)
+    moved = cameras.relative_to(-shift)
+    origin = local_origin(moved)
+    there = render.PointCloud(read_ply(cloud, origin), origin)
+    white = torch.ones(3)
+    for i in range(len(cameras)):
+        drawn, wanted = there.render(moved[i], white), rasterise(near, cameras[i], white)
+        assert wanted.alpha.max() > 0.1
+        assert (drawn.rgb - wanted.rgb).abs().max() < 1e-3
 
 
 def test_a_video_lies_beside_the_file(cloud):

@@ -141,16 +141,19 @@ def open_point_cloud(options: Options) -> Subject:
 
     from visdom_plugin.cli.report import say
     from visdom_plugin.cli.scenes import open_scene
+    from visdom_plugin.geometry.local_frame import local_origin
     from visdom_plugin.splat.ply import read_ply
 
     device = torch.device(resolve_device(options.device))
-    gaussians = read_ply(options.run).to(device)
     reading = read_options(options) | {"missing_masks": "colour"}
     scene = open_scene(options.data, **reading, fill=False, test=options.path == "test")
+    # Float32 holds them near the scene only, wherever the file's frame has its origin.
+    origin = local_origin(scene.train.cameras)
+    gaussians = read_ply(options.run, origin).to(device)
     if not options.quiet:
         whose = " (--data DIR names another scene)" if options.data is None else ""
         say(f"{len(gaussians)} Gaussians seen by the cameras of {scene.name}{whose}")
-    return scene, PointCloud(gaussians), None, device
+    return scene, PointCloud(gaussians, origin), None, device
 
 
 @dataclass(frozen=True)
@@ -158,12 +161,14 @@ class PointCloud:
     """Gaussians that render as a trained method does."""
 
     gaussians: Gaussians
+    origin: Tensor
+    """(3,) float64 of their frame, in the cameras' frame."""
 
     def render(self, camera: Cameras, background: Tensor) -> Render:
         """Their picture; `splat.rasterise` has the details."""
         from visdom_plugin.splat.rasterise import rasterise
 
-        return rasterise(self.gaussians, camera, background)
+        return rasterise(self.gaussians, camera.relative_to(self.origin), background)
 
 
 def default_target(options: Options) -> Path:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras, pixel_radius, rays_of
 from visdom_plugin.geometry.mesh_files import mesh_ply
-from visdom_plugin.hooks.protocols import SamplerHook
+from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook
 from visdom_plugin.losses import composite_target, mask_loss
 from visdom_plugin.nerf.frame import Frame
 from visdom_plugin.nerf.optimiser import FieldOptimiser
@@ -46,6 +46,7 @@ def bound_rays(
     far: Tensor,
     frame: Frame,
     hooks: Sequence[SamplerHook],
+    pixels: Tensor | None = None,
 ) -> LocalRays:
     """Rays in the field's frame, bounded by every hook in turn.
 
@@ -53,12 +54,24 @@ def bound_rays(
         origins, directions: (n, 3) world frame; directions unit.
         near, far: (n,) the method's own bounds, in the field's frame.
         hooks: they see the world frame.
+        pixels: (n,) numbers of training pixels, see `PixelBatch`; None for other rays.
     """
     hit = torch.ones_like(near, dtype=torch.bool)
     for hook in hooks:
-        bounds = hook.bound(origins, directions, near / frame.scale, far / frame.scale)
+        limits = near / frame.scale, far / frame.scale
+        if pixels is not None and isinstance(hook, PixelSampler):
+            bounds = hook.bound_pixels(pixels, origins, directions, *limits)
+        else:
+            bounds = hook.bound(origins, directions, *limits)
         near, far, hit = bounds.near * frame.scale, bounds.far * frame.scale, hit & bounds.hit
     return LocalRays(frame.to_local(origins), directions.float(), near.float(), far.float(), hit)
+
+
+def follow_pixels(hooks: Sequence[SamplerHook], cameras: Cameras) -> None:
+    """Tells hooks that can make use of it which cameras (N,), on the rays' device, the training pixels are of."""
+    for hook in hooks:
+        if isinstance(hook, PixelSampler):
+            hook.follow_pixels(cameras)
 
 
 def spread_rays(camera: Cameras, most: int = 256) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,7 @@ from visdom_plugin.methods.fields.common import (
     LocalRays,
     bound_rays,
     export_mesh,
+    follow_pixels,
     mesh_density,
     photograph_on,
     psnr_of,
@@ -59,6 +60,7 @@ class Ingp:
         c = self.config
         self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
         self.frame = frame_of(views.cameras)
+        follow_pixels(self.hooks, views.cameras.to(device))
         draw = generator(seed, "field")
         self.table = torch.nn.Parameter(initial_table(c.grid, draw).to(device))
         self.density_net = perceptron([c.grid.width, c.hidden, 1 + c.geometry_features], draw).to(device)
@@ -96,7 +98,7 @@ class Ingp:
         n = len(batch.mask)
         background = torch.rand(n, 3, generator=draw) if c.background == "random" else torch.ones(n, 3)
         background = background.to(self.device)
-        rays = self._bound(batch.origins, batch.directions, self.hooks)
+        rays = self._bound(batch.origins, batch.directions, self.hooks, batch.pixels)
         step_length = torch.where(rays.hit, c.step_length, c.missing_step_length)
         shift = torch.rand(n, generator=draw).to(self.device)
         samples = self._march(rays, rays.far, step_length, shift, self.hooks)
@@ -157,10 +159,16 @@ class Ingp:
     def _hooks_at_inference(self) -> list[SamplerHook]:
         return self.hooks if self.config.vd.hull_at_inference else []
 
-    def _bound(self, origins: Tensor, directions: Tensor, hooks: Sequence[SamplerHook]) -> LocalRays:
+    def _bound(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        hooks: Sequence[SamplerHook],
+        pixels: Tensor | None = None,
+    ) -> LocalRays:
         enter, leave = intersect_cube(self.frame.to_local(origins), directions.float(), self.config.half_side)
         near = enter.clamp_min(self.config.near)
-        return bound_rays(origins, directions, near, torch.maximum(leave, near), self.frame, hooks)
+        return bound_rays(origins, directions, near, torch.maximum(leave, near), self.frame, hooks, pixels)
 
     def _march(
         self, rays: LocalRays, far: Tensor, step_length: Tensor, shift: Tensor, hooks

@@ -15,6 +15,7 @@ from visdom_plugin.methods.fields.common import (
     LocalRays,
     bound_rays,
     export_mesh,
+    follow_pixels,
     mesh_density,
     photograph_on,
     psnr_of,
@@ -122,6 +123,7 @@ class ZipNerfLite:
         c = self.config
         self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
         self.frame = frame_of(views.cameras)
+        follow_pixels(self.hooks, views.cameras.to(device))
         draw = generator(seed, "field")
         self.model = nn.ModuleDict(
             {
@@ -147,7 +149,7 @@ class ZipNerfLite:
         n = len(batch.mask)
         background = torch.rand(n, 3, generator=draw) if c.background == "random" else torch.ones(n, 3)
         background = background.to(self.device)
-        rays = self._bound(batch.origins, batch.directions, self.hooks)
+        rays = self._bound(batch.origins, batch.directions, self.hooks, batch.pixels)
         progress = step / max(c.steps, 1)
         levels, colours = self._see(rays, batch.radii, c.samples, progress, draw)
         last = levels[-1]
@@ -205,10 +207,16 @@ class ZipNerfLite:
         mesh = mesh_density(self._density, self._colour, self.frame, half_side=1.0)
         return export_mesh(Path(folder) / "mesh.ply", mesh, self.origin)
 
-    def _bound(self, origins: Tensor, directions: Tensor, hooks: Sequence[SamplerHook]) -> LocalRays:
+    def _bound(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        hooks: Sequence[SamplerHook],
+        pixels: Tensor | None = None,
+    ) -> LocalRays:
         near = torch.full(origins.shape[:-1], self.config.near, device=origins.device)
         far = torch.full_like(near, self.config.far)
-        return bound_rays(origins, directions, near, far, self.frame, hooks)
+        return bound_rays(origins, directions, near, far, self.frame, hooks, pixels)
 
     def _see(self, rays: LocalRays, radius, counts: Sequence[int], progress: float, draw):
         """All levels along rays, and the field's colours (n, S, 3). Samples are jittered by the generator."""
