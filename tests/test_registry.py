@@ -275,7 +275,10 @@ def test_the_list_imports_no_method_and_the_doctor_tells_what_is_wrong_with_each
     assert listed.stderr.count("\n") == 1 and "no licence" in listed.stderr
     doctor = _command(tmp_path, "--doctor", VISDOM_METHODS=variable).stdout
     assert "RuntimeError: loaded" in doctor and "method light cannot be loaded" in doctor
-    assert "VISDOM_METHODS (slow:SPEC) imports torch" in doctor and "(light:SPEC) imports" not in doctor
+    assert (
+        "listing VISDOM_METHODS (slow:SPEC)'s methods imports torch" in doctor
+        and "(light:SPEC)'s" not in doctor
+    )
     assert "(exits:SPEC) was skipped" in doctor and "sys.exit('no licence')" in doctor
     assert "importlib" not in doctor
 

@@ -1,4 +1,4 @@
-"""Files that are either there, whole, or not there."""
+"""Atomic files: each is there whole, or not there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can go wrong for a user, said so that they can mend it."""
+"""Errors of a user, said so that they can be mended, and lists of names in them."""
 
 from __future__ import annotations
 

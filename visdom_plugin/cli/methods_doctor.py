@@ -1,4 +1,4 @@
-"""What this environment offers, line by line, for `visdom-methods --doctor`."""
+"""Lists what this environment offers, line by line, for `visdom-methods --doctor`."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def examine(known: Registry) -> list[str]:
     lines += _unusable(known)
     for origin, (seconds, heavy) in known.slow.items():
         lines.append(
-            f"warning: to tell its methods' names, {origin} imports {', '.join(heavy)} ({seconds:.1f} s of every "
-            "--help); its MethodSpec belongs into a module that imports nothing heavy"
+            f"warning: listing {origin}'s methods imports {', '.join(heavy)} ({seconds:.1f} s per --help); move "
+            "its MethodSpec to a module that imports nothing heavy"
         )
     for skipped in known.skipped:
         lines += _story(skipped)

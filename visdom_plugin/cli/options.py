@@ -1,4 +1,4 @@
-"""From the words on the command line to a method, its settings and the common options.
+"""Options of the commands, and the parse of a command line into a method, its settings and these options.
 
 Later wins: preset (by budget), then the file of --config, then the command line.
 """
@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
 from dataclasses import field as dataclass_field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, cast, get_args
 
 import tyro
 
@@ -252,8 +252,8 @@ def choose_budget(budget: str, device: str, ask_torch: bool = True) -> tuple[Bud
 
     Without `ask_torch`, a driver is taken for a CUDA device.
     """
-    if budget == "quick" or budget == "full":
-        return budget, f"budget {budget}"
+    if budget in get_args(Budget):
+        return cast(Budget, budget), f"budget {budget}"
     # Help must not wait for torch: without a driver there is no CUDA, and with one it is the likely case.
     if device == "auto":
         device = "cuda" if Path("/dev/nvidiactl").exists() else "cpu"

@@ -1,4 +1,4 @@
-"""What a command says on the terminal when it is done."""
+"""Messages on the terminal: one line, or a run's metrics."""
 
 from __future__ import annotations
 

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from visdom_plugin.scene import Scene
+from visdom_plugin.scene import Scene, Views
+
+if TYPE_CHECKING:
+    import torch
+
+    from visdom_plugin.training.batches import DataManager
+    from visdom_plugin.training.missing_masks import Way
 
 
-def make_data_manager(views, seed: int, device) -> Any:
+def make_data_manager(views: Views, seed: int, device: torch.device) -> DataManager:
     """Batches of the training views on a device."""
     from visdom_plugin.training.batches import DataManager
 
@@ -21,7 +27,7 @@ def open_scene(
     views: int,
     downscale: float,
     seed: int,
-    missing_masks: str = "error",
+    missing_masks: Way = "error",
     fill: bool = True,
     **reading: Any,
 ) -> Scene:

@@ -1,4 +1,4 @@
-"""Does a method keep the promises of `training.protocols.Method` and `hooks.protocols`?
+"""Tests whether a method keeps the promises of `training.protocols.Method` and `hooks.protocols`.
 
     pytest --pyargs visdom_plugin.conformance --method NAME
 

@@ -106,7 +106,7 @@ def distance(one: dict[int, Tensor], other: dict[int, Tensor]) -> float:
     """Euclidean distance of two gradients."""
     total = 0.0
     for name in one.keys() | other.keys():
-        a, b = one.get(name), other.get(name)
-        gap = a if b is None else b if a is None else a - b
+        absent = torch.zeros(())
+        gap = one.get(name, absent) - other.get(name, absent)
         total += float(gap.double().square().sum())
     return total**0.5

@@ -1,4 +1,4 @@
-"""What a stranger reads when a promise is not kept."""
+"""Report on a promise that is not kept, for the method's author."""
 
 from __future__ import annotations
 

@@ -65,7 +65,8 @@ class Subject:
         preset = known.find(name)
         self.name = preset.name
         vd = known.presets.get(f"{preset.name}+vd")
-        self.bare, self.hooked = preset, vd
+        self.bare: Preset | None = preset
+        self.hooked: Preset | None = vd
         if vd is None and getattr(getattr(preset.quick, "vd", None), "enabled", False):
             self.bare, self.hooked = None, preset
         self.main: Preset = self.hooked or preset
@@ -142,10 +143,12 @@ class Subject:
     @cached_property
     def trained_bare(self) -> Run:
         """The same for the variant without the hook."""
+        assert self.bare is not None, "asked for a method without a bare variant"
         return self.run(self.start(self.bare.quick), 0, self.length, keep=(self.short,))
 
     def switch_off(self) -> Any:
         """The bare variant's config with the hook's settings, the hook off, and its hull if it has none itself."""
+        assert self.bare is not None, "asked for a method without a bare variant"
         bare, vd = self.bare.quick, self.config
         changes = {"vd": replace(vd.vd, enabled=False)}
         if "hull" in {f.name for f in fields(bare)} and bare.hull is None:
@@ -167,8 +170,8 @@ def seed_all(seed: int) -> None:
 
 def global_luck() -> list[Any]:
     """The state of all global generators."""
-    name, numbers, position, *_ = np.random.get_state()  # noqa: NPY002
-    return [torch.get_rng_state().tolist(), name, numbers.tolist(), position, random.getstate()]
+    twister = np.random.get_state(legacy=False)["state"]  # noqa: NPY002
+    return [torch.get_rng_state().tolist(), twister["key"].tolist(), twister["pos"], random.getstate()]
 
 
 def difference(one: State, other: State) -> str:

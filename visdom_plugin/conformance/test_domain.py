@@ -1,4 +1,4 @@
-"""What a method does with its hook."""
+"""Tests of what a method does with its hook."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What any trainer relies on."""
+"""Tests of what any trainer relies on."""
 
 from __future__ import annotations
 

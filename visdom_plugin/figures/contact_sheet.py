@@ -155,7 +155,7 @@ def _write_mpeg4(path: Path, frames: list[np.ndarray], fps: int) -> None:
     import cv2
 
     h, w = frames[0].shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), fps, (w, h))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (w, h))
     if not writer.isOpened():
         raise OSError(f"OpenCV could not open {path} for video")
     for frame in frames:

@@ -1,4 +1,4 @@
-"""What a table can show of a run: where it stands in run.json, its unit, and which way is better."""
+"""Measures that a table can show of a run: place in run.json, unit, and which way is better."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's own numbers, to stand beside ours: CSV files in `paper_numbers/`, and how a cell finds its one.
+"""The paper's numbers, to stand beside ours: reads the CSV files in `paper_numbers/` and finds a cell's entry.
 
 Columns: table, dataset, views, method, variant, metric, value. `views` is a number of cameras, "mean" (over the
 numbers of cameras, as printed) or "all".
@@ -40,8 +40,8 @@ class Numbers:
         if key in self.values or key[-1] not in _GAIN:
             return self.values.get(key)
         gain, base = _GAIN[key[-1]]
-        found = self.values.get((*key[:-1], gain)), self.values.get((*key[:3], base, key[-1]))
-        return None if None in found else sum(found)
+        more, less = self.values.get((*key[:-1], gain)), self.values.get((*key[:3], base, key[-1]))
+        return None if more is None or less is None else more + less
 
     def check(self, given: Mapping[str, object] | None, where: object) -> None:
         """Refuses fields and values that this table of the paper does not have.

@@ -1,4 +1,4 @@
-"""Numbers of different protocols do not stand in one table, unless the table says that they may.
+"""Protocols of a table's numbers: different ones are refused in one table, unless the table allows it.
 
 Before the first job, settings are compared: budget and downscale, and of rows with a visible-domain hook (of all
 rows, in a hull table) K and the kind of hull. When runs are finished, their records are: evaluation background,

@@ -1,4 +1,4 @@
-"""Jobs and what became of them: what the executors fill and the writers read."""
+"""Jobs of a table and their outcomes, which executors fill in and writers read."""
 
 from __future__ import annotations
 

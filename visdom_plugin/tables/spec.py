@@ -256,7 +256,7 @@ def _tidy_column(column: dict[str, Any]) -> dict[str, Any]:
 
 def flatten(settings: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     """Nested mappings to dotted paths: {"hull": {"k": 2}} and {"hull.k": 2} say the same."""
-    flat = {}
+    flat: dict[str, Any] = {}
     for key, value in settings.items():
         name = f"{path}.{key}" if path else str(key)
         flat |= flatten(value, name) if isinstance(value, dict) else {name: value}

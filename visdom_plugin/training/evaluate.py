@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from visdom_plugin.figures.contact_sheet import (
     write_png,
 )
 from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.training import metrics
 from visdom_plugin.training.protocols import Method
@@ -99,7 +100,15 @@ def _remove_others(folder: Path, names: Sequence[str]) -> None:
             path.unlink()
 
 
-def render_on_white(method: Method, camera: Cameras, device: torch.device) -> tuple[Tensor, Tensor]:
+class Renderer(Protocol):
+    """Anything that draws what a camera sees: a trained method, or Gaussians from a file."""
+
+    def render(self, camera: Cameras, background: Tensor) -> Render:
+        """One view on a background colour (3,); both are on the same device."""
+        ...
+
+
+def render_on_white(method: Renderer, camera: Cameras, device: torch.device) -> tuple[Tensor, Tensor]:
     """One view on white, on the CPU: rgb (H, W, 3) unclamped and alpha (H, W)."""
     with torch.no_grad():
         render = method.render(camera.to(device), torch.ones(3, device=device))

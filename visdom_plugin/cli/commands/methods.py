@@ -1,4 +1,4 @@
-"""visdom-methods: what can be trained here, and with what."""
+"""visdom-methods: lists the methods that can be trained here, and the libraries found."""
 
 from __future__ import annotations
 

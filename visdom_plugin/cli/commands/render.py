@@ -1,4 +1,4 @@
-"""visdom-render: pictures or a video of a run, or of any 3DGS point cloud, along a camera path."""
+"""visdom-render: draws a run, or any 3DGS point cloud, along a camera path."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from visdom_plugin.render import Render
     from visdom_plugin.scene import Scene
     from visdom_plugin.splat.gaussians import Gaussians
-    from visdom_plugin.training.protocols import Method
+    from visdom_plugin.training.evaluate import Renderer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +106,7 @@ def _render(argv: Sequence[str]) -> None:
         sys.stdout.write(f"{target}\n")
 
 
-Subject = tuple["Scene", "Method | PointCloud", "Hull | None", "torch.device"]
+Subject = tuple["Scene", "Renderer", "Hull | None", "torch.device"]
 """What is drawn: the scene with the cameras, what renders, its hull, where."""
 
 

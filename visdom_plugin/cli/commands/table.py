@@ -1,4 +1,4 @@
-"""visdom-table: a table of methods, scenes, views and seeds from a file, with every run behind it."""
+"""visdom-table: makes a table of methods, scenes, views and seeds from a file, and the runs behind it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""visdom-train: from photographs to a trained, measured reconstruction."""
+"""visdom-train: trains a method on posed, masked photographs and measures it."""
 
 from __future__ import annotations
 

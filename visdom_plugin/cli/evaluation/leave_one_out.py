@@ -1,4 +1,4 @@
-"""visdom-eval --leave-one-out: how good a method is where there are no photographs to test on.
+"""visdom-eval --leave-one-out: measures a method where there are no photographs to test on.
 
 Each training view in turn is held out: hull, bounds, normalisation, start and training are made without it, then
 it is rendered and measured. Each of these runs has a run directory of its own, which resumes.
@@ -184,7 +184,7 @@ def summarise(per_view: dict[str, dict[str, float | None]]) -> dict[str, Any]:
     mean: dict[str, Any] = {}
     worst: dict[str, Any] = {}
     for name in NAMES:
-        values = {view: row[name] for view, row in per_view.items() if row.get(name) is not None}
+        values = {view: value for view, row in per_view.items() if (value := row.get(name)) is not None}
         mean[name] = sum(values.values()) / len(values) if values else None
         choose = max if name in ("outside_hull_mass", "lpips") else min
         view = choose(values, key=values.__getitem__) if values else None

@@ -10,7 +10,8 @@ import logging
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -27,11 +28,14 @@ from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.tables.results import Job, Outcome, Results
 from visdom_plugin.tables.spec import Column, Row, TableSpec, flatten, nest
 
+if TYPE_CHECKING:
+    from visdom_plugin.scene import Scene, Views
+
 log = logging.getLogger(__name__)
 
 NAME = "ablation"
 DEFAULT_METHOD = "ingp"
-VARIANTS = (
+VARIANTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("vanilla", "", {}),
     ("+mask", "+mask", {}),
     ("+unit sphere", "+vd", {"hull.kind": "unit-sphere"}),
@@ -76,10 +80,9 @@ def ablation(argv: Sequence[str]) -> int:
         raise ConfigError(f"the {NAME} has no editions", where=f"--edition {options.edition}")
     spec = make_spec(named or DEFAULT_METHOD, options)
     out, runs = find_folders(spec, options)
-    options = replace(options, out=out, runs=runs)
     scene = _open(spec, options)
     if options.leave_one_out:
-        return _run_folds(spec, scene, options)
+        return _run_folds(spec, scene, options, out, runs)
     if not len(scene.test):
         raise SceneError(
             "this scene has no test views to measure on",
@@ -89,7 +92,7 @@ def ablation(argv: Sequence[str]) -> int:
     status, results = run_spec(spec, options)
     if results is not None:
         for views in spec.columns[0].views:
-            _draw(results, views, scene.test, options)
+            _draw(results, views, scene.test, out, options.quiet)
     return status
 
 
@@ -130,7 +133,7 @@ def make_spec(method: str, options: AblationOptions) -> TableSpec:
 def _read_settings(words: Sequence[str]) -> dict[str, Any]:
     import yaml
 
-    found = {}
+    found: dict[str, Any] = {}
     for word in words:
         path, equals, value = word.partition("=")
         if not (path and equals and value):
@@ -155,18 +158,18 @@ def _fitting(row: Row, preset: Any) -> dict[str, Any]:
     return {k: v for k, v in row.settings.items() if not (bare and k.startswith("hull."))}
 
 
-def _open(spec: TableSpec, options: AblationOptions) -> Any:
+def _open(spec: TableSpec, options: AblationOptions) -> Scene:
     """The scene whose views the figure shows: at the first number of views, with the first seed."""
     from visdom_plugin.cli.scenes import open_scene
 
     column = spec.columns[0]
-    asked = {"views": column.views[0], "downscale": column.downscale, "seed": spec.seeds[0]}
+    asked: dict[str, Any] = {"views": column.views[0], "downscale": column.downscale, "seed": spec.seeds[0]}
     if options.leave_one_out:
         asked |= {"fill": False, "hold_out": False}
     return open_scene(options.data, **asked)
 
 
-def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
+def _run_folds(spec: TableSpec, scene: Scene, options: AblationOptions, out: Path, runs: Path) -> int:
     """The same table with every training view held out in turn; the views stand as the table's scenes."""
     from visdom_plugin.cli.evaluation import leave_one_out as folds
     from visdom_plugin.cli.report import say
@@ -197,7 +200,7 @@ def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
     spec = replace(spec, columns=(replace(column, scenes=names, label=f"{scene.name}, each view held out"),))
     outcomes: dict[Job, Outcome] = {}
     for i, (row, request) in enumerate(zip(spec.rows, requests, strict=True)):
-        folder = options.runs / _name_of(row, request)
+        folder = runs / _name_of(row, request)
         summary: dict[str, Any] = {"runs": {}, "failed": {}}
         if only is None or i in only:
             if not options.quiet:
@@ -212,10 +215,10 @@ def _run_folds(spec: TableSpec, scene: Any, options: AblationOptions) -> int:
                 outcome = Outcome("finished", record=read_record(run_dir))
             outcomes[Job(i, 0, name, column.views[0], spec.seeds[0], run_dir)] = outcome
     results = Results(spec, outcomes)
-    write_all(results, options.out)
-    _draw(results, column.views[0], scene.train, options)
+    write_all(results, out)
+    _draw(results, column.views[0], scene.train, out, options.quiet)
     if not options.quiet:
-        sys.stdout.write((options.out / "table.md").read_text(encoding="utf-8"))
+        sys.stdout.write((out / "table.md").read_text(encoding="utf-8"))
     return 1 if any(o.status == "failed" for o in outcomes.values()) else 0
 
 
@@ -242,14 +245,14 @@ def _request(row: Row, budget: str, common: Any, note: str, make: Any) -> Any:
     return make(preset, config, common, note)
 
 
-def _draw(results: Results, views: int, photographs: Any, options: AblationOptions) -> None:
+def _draw(results: Results, views: int, photographs: Views, out: Path, quiet: bool) -> None:
     """Writes the figure of one number of views, seed by seed averaged numbers, the first seed's pictures."""
     from visdom_plugin.cli.report import say
     from visdom_plugin.cli.table_parts.ablation_figure import draw_figure
     from visdom_plugin.figures.contact_sheet import write_png
 
     several = len(results.spec.columns[0].views) > 1
-    path = options.out / (f"{NAME}-{views}.png" if several else f"{NAME}.png")
+    path = out / (f"{NAME}-{views}.png" if several else f"{NAME}.png")
     write_png(path, draw_figure(results, views, photographs, VIEWS_SHOWN))
-    if not options.quiet:
+    if not quiet:
         say(f"look at: {path}")

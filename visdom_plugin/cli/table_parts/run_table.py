@@ -1,4 +1,4 @@
-"""Running a table as the command line asks: what it changes of the file, where the runs go, who runs them."""
+"""Runs a table as the command line asks: its options, what they change of the file, folders, executor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What visdom-table must know of data before a run starts: whether it is still the same, and how it is read."""
+"""Hashes of the files that a table's jobs read, and the check of a column's `reading`."""
 
 from __future__ import annotations
 

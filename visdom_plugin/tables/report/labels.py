@@ -1,4 +1,4 @@
-"""What cells, heads and footers say, in plain text that every writer escapes in its own way."""
+"""Words of cells, heads and footers, in plain text that every writer escapes in its own way."""
 
 from __future__ import annotations
 

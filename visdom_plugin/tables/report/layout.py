@@ -1,4 +1,4 @@
-"""How a table is laid out: the `layout` entry of its file, and the blocks that every writer prints."""
+"""Layout of a table: the `layout` entry of its file, and the blocks that every writer prints."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def read_layout(spec: TableSpec) -> Layout:
 
 def list_views(spec: TableSpec, column: int) -> list[int | str]:
     """The numbers of views a column prints, with "mean" where the layout asks for it."""
-    views = list(spec.columns[column].views)
+    views: list[int | str] = list(spec.columns[column].views)
     return [*views, MEAN] if len(views) > 1 and read_layout(spec).mean else views
 
 

@@ -10,6 +10,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 log = logging.getLogger(__name__)
 
 ERROR_FULL = 0.5
@@ -75,11 +77,11 @@ def _read(
     scale = min(1.0, height_px / truth.shape[0])
     small = [max(1, round(n * scale)) for n in truth.shape[1::-1]]
     truth, render = (cv2.resize(p, small, interpolation=cv2.INTER_AREA) for p in (truth, render))
-    drawn = (truth, render, contact_sheet.draw_error(truth, render))
-    return names[shown[column]], *(_encode(picture) for picture in drawn)
+    error = contact_sheet.draw_error(truth, render)
+    return names[shown[column]], _encode(truth), _encode(render), _encode(error)
 
 
-def _encode(picture) -> bytes:
+def _encode(picture: np.ndarray) -> bytes:
     import cv2
 
     ok, data = cv2.imencode(".png", picture[..., ::-1])

@@ -1,4 +1,4 @@
-"""From runs to cells: views are averaged per scene (run.json has that mean), then scenes, then seeds.
+"""Averages of runs, cell by cell: views per scene (run.json has that mean), then scenes, then seeds.
 
 A cell is one row, one column, one number of views (or "mean" over them) and one measure. Sums are exact
 (`math.fsum`), so that the order of jobs, scenes and seeds leaves no trace.
@@ -98,8 +98,10 @@ def summarise(results: Results) -> Summary:
     measures = [find_measure(name, spec.source or spec.name) for name in spec.metrics]
     numbers = load_numbers(spec.paper) if spec.paper else None
     if numbers is not None:
-        for entry in (*spec.rows, *spec.columns):
-            numbers.check(entry.paper, f"{spec.source or spec.name}, {entry.label!r}")
+        entries = [(row.paper, row.label) for row in spec.rows]
+        entries += [(column.paper, column.label) for column in spec.columns]
+        for place, label in entries:
+            numbers.check(place, f"{spec.source or spec.name}, {label!r}")
     jobs = {
         (job.row, job.column, job.views, job.scene, job.seed): (job, outcome)
         for job, outcome in results.outcomes.items()
@@ -160,7 +162,7 @@ def _contest(cell: Cell, groups: Sequence[str]) -> tuple:
 
 
 def _printed(cell: Cell) -> float:
-    return round(cell.mean, MEASURES[cell.measure].digits)
+    return round(math.nan if cell.mean is None else cell.mean, MEASURES[cell.measure].digits)
 
 
 def _is_better(x: float, y: float, measure: str) -> bool:
@@ -177,7 +179,8 @@ def _values_of(jobs, place, scenes, seeds, measure: Measure) -> Iterable[SceneVa
             value = measure.read(outcome.record) if status == "finished" else None
         if status == "finished" and value is None:
             status = "not measured"
-        yield SceneValue(*place, scene, seed, measure.name, value, status, error, job)
+        row, column, views = place
+        yield SceneValue(row, column, views, scene, seed, measure.name, value, status, error, job)
 
 
 def _average(values: list[SceneValue], r: int, c: int, views, measure: Measure, paper: float | None) -> Cell:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -118,7 +118,7 @@ def pen(number: int) -> tuple[str, str]:
     return to_hex(colormaps["tab10"](number % 10)), "dashed" if number // 10 % 2 else "solid"
 
 
-def _make_axes(height: int, left: int, grid: str) -> tuple[Figure, Axes]:
+def _make_axes(height: int, left: int, grid: Literal["x", "y"]) -> tuple[Figure, Axes]:
     """Axes without frame and ticks, so that the grid alone carries the numbers."""
     from matplotlib.figure import Figure
 

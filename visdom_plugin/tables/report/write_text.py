@@ -76,8 +76,14 @@ def to_scene_csv(spec: TableSpec, summary: Summary, folder: Path) -> str:
     lines = []
     for v in summary.scenes:
         row, column = spec.rows[v.row], spec.columns[v.column]
-        place = {"row": row.label, "method": row.method, "column": column.label, "metric": v.measure}
-        place["run"] = _seen_from(folder, v.job.run_dir if v.job else None)
+        run = _seen_from(folder, v.job.run_dir if v.job else None)
+        place = {
+            "row": row.label,
+            "method": row.method,
+            "column": column.label,
+            "metric": v.measure,
+            "run": run,
+        }
         lines.append(place | {name: getattr(v, name) for name in SCENE_FIELDS if name not in place})
     return _write_csv(SCENE_FIELDS, lines)
 

@@ -1,4 +1,4 @@
-"""Where tasks run: in this process, or in N processes of this machine. The cluster is in tables.slurm.
+"""Executors: run tasks in this process, or in N processes of this machine. `slurm` has the cluster.
 
 Executors start tasks and say which ones ended; what an end means is the driver's to judge, from the run directory.
 """

@@ -1,4 +1,4 @@
-"""What a run directory and the files beside it say about a job. Reads; never waits.
+"""Files of a job, in its run directory and beside it: outcome, error, log, lock. Never waits.
 
 runs/<name>/            the run directory of the job's command
 runs/<name>.yaml        its settings, for --config

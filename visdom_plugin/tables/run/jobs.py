@@ -1,4 +1,4 @@
-"""From a table to its jobs: every setting resolved and every scene found before anything runs.
+"""Jobs of a table: every setting is resolved and every scene found before anything runs.
 
 A job's run directory is named after a hash of its resolved settings, seed and the files it reads, so that the same
 run is found again by any table, and a changed setting or photograph makes another run.
@@ -120,26 +120,25 @@ def plan(spec: TableSpec, runs: Path, workshop: Workshop, roots: Mapping[str, Pa
     readings = [workshop.tidy_reading(column.reading, _place(spec, column)) for column in spec.columns]
     refuse_mixture(_facts(spec, resolved), spec.varies, spec.source)
     folders = [_find_scenes(spec, column, dict(roots or {})) for column in spec.columns]
-    found = {path for scenes in folders if scenes for path in scenes.values() if path is not None}
-    if found:
-        log.info("looking at the files of %d scenes", len(found))
+    looked_at = {path for scenes in folders if scenes for path in scenes.values() if path is not None}
+    if looked_at:
+        log.info("looking at the files of %d scenes", len(looked_at))
     jobs: dict[Job, Outcome] = {}
     tasks: dict[Path, Task] = {}
-    for i in range(len(spec.rows)):
-        for j, column in enumerate(spec.columns):
+    for i, found in enumerate(resolved):
+        for j, (column, paths) in enumerate(zip(spec.columns, folders, strict=True)):
             for scene in column.scenes:
                 for views in column.views:
                     for seed in spec.seeds:
                         job = Job(i, j, scene, views, seed)
-                        if resolved[i] is None:
+                        if found is None:
                             jobs[job] = Outcome("not available")
-                        elif folders[j] is None:
+                        elif paths is None:
                             jobs[job] = Outcome("no data")
                         else:
-                            reading = {"views": views, "downscale": column.downscale}
+                            reading: dict[str, Any] = {"views": views, "downscale": column.downscale}
                             reading |= {"data_format": column.data_format, **readings[j]}
-                            path = folders[j][scene]
-                            task = _make_task(spec, job, resolved[i], path, reading, runs, workshop)
+                            task = _make_task(spec, job, found, paths[scene], reading, runs, workshop)
                             task = tasks.setdefault(task.run_dir, task)
                             jobs[replace(job, run_dir=task.run_dir, argv=task.argv)] = Outcome("waiting")
     return Plan(spec, jobs, tasks)

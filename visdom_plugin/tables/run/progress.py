@@ -1,4 +1,4 @@
-"""How far a table is, over all its jobs: a bar on a terminal, lines elsewhere."""
+"""Progress of a table over all its jobs: a bar on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What drivers submitted to a Slurm cluster: noted on disk, and in the cluster's queue.
+"""Notes on what drivers submitted to a Slurm cluster, and the cluster's queue.
 
 slurm.json  {"batches": {name: {"id": of the array, "time": of the note, "runs": names of run directories}}}
 slurm.lock  held while slurm.json is read, changed and written
