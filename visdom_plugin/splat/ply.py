@@ -38,10 +38,10 @@ def write_gaussians(path: str | Path, gaussians: Gaussians, origin: Tensor | Non
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh.shape[1] - 1))
     columns = [np.zeros((n, 3)), sh[:, 0], rest, arrays["opacity_logits"][:, None]]
     columns += [arrays["log_scales"], arrays["quaternions"]]
-    far = origin is not None and bool(origin.any())
-    names, places = _names(rest.shape[1]), "double" if far else "float"
+    far = origin if origin is not None and bool(origin.any()) else None
+    names, places = _names(rest.shape[1]), "float" if far is None else "double"
     table = np.empty(n, [("xyz", _TYPES[places], 3), ("rest", "<f4", len(names) - 3)])
-    table["xyz"] = gaussians.means.detach().cpu().double() + origin if far else arrays["means"]
+    table["xyz"] = arrays["means"] if far is None else gaussians.means.detach().cpu().double() + far
     table["rest"] = np.concatenate(columns, 1)
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
     header += [f"property {places} {name}" for name in names[:3]]
