@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 
 from datamodules.synthetic.scene import SyntheticConfig, make_scene
-from method_configs.gs_go import QUICK
+from method_configs.gs_go import SPEC
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.splats.gs_go import GsGo
@@ -34,7 +34,11 @@ def main() -> None:
     domain = VisibleDomain(k=min(3, len(kept)), resolution=96)
     vd = RegularizerConfig(enabled=given.vd)
     config = replace(
-        QUICK, steps=given.steps, hull=domain, vd=vd, mask_weight=0.1 if given.vd else QUICK.mask_weight
+        SPEC.quick,
+        steps=given.steps,
+        hull=domain,
+        vd=vd,
+        mask_weight=0.1 if given.vd else SPEC.quick.mask_weight,
     )
     masks = tuple(m if i in kept else torch.ones_like(m) for i, m in enumerate(train.masks))
     origins = tuple("given" if i in kept else "missing" for i in range(given.views))

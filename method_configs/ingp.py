@@ -5,50 +5,32 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from visdom_plugin.hooks.configs import SamplerConfig
-from visdom_plugin.hull.domain import TRAINING_DOMAIN
 from visdom_plugin.methods.fields.configs import IngpConfig
 from visdom_plugin.nerf.encoding.hash_layout import HashLayout
-from visdom_plugin.registry import Preset
+from visdom_plugin.registry import MethodSpec
 
-FULL = IngpConfig()
-
-QUICK = IngpConfig(
-    steps=800,
-    max_rays=1024,
-    samples_per_step=1 << 14,
-    step_length=0.012,
-    missing_step_length=0.096,
-    grid=HashLayout(8, 2, base_resolution=16, max_resolution=256, log2_table_size=16),
-    hidden=32,
-    view_degree=2,
-    density_bias=-3.0,
-    occupancy_resolution=64,
-    occupancy_warm_up=64,
-    occupancy_fraction=0.06,
-    lr_warm_up=50,
+SPEC = MethodSpec(
+    "ingp",
+    "visdom_plugin.methods.fields.ingp:Ingp",
+    quick=IngpConfig(
+        steps=800,
+        max_rays=1024,
+        samples_per_step=1 << 14,
+        step_length=0.012,
+        missing_step_length=0.096,
+        grid=HashLayout(8, 2, base_resolution=16, max_resolution=256, log2_table_size=16),
+        hidden=32,
+        view_degree=2,
+        density_bias=-3.0,
+        occupancy_resolution=64,
+        occupancy_warm_up=64,
+        occupancy_fraction=0.06,
+        lr_warm_up=50,
+    ),
+    full=IngpConfig(),
+    hook="sampler",
+    description="Instant-NGP",
+    # The vanilla variant sees photographs on white. Those that use masks see them on random colours, too: a
+    # photograph with alpha is what Instant-NGP is made for. FINDINGS.md has what it brings.
+    variants={"mask": {"background": "random"}, "vd": {"background": "random"}},
 )
-
-# The vanilla variant sees photographs on white. Those that use masks see them on random colours, too: a photograph
-# with alpha is what Instant-NGP is made for. FINDINGS.md has what it brings.
-MASK = {"mask_weight": 0.1, "background": "random"}
-VD = MASK | {"hull": TRAINING_DOMAIN, "vd": SamplerConfig(enabled=True)}
-
-
-def _preset(suffix: str, description: str, changes: dict) -> Preset:
-    return Preset(
-        name=f"ingp{suffix}",
-        description=description,
-        target="visdom_plugin.methods.fields.ingp:Ingp",
-        quick=replace(QUICK, **changes),
-        full=replace(FULL, **changes),
-    )
-
-
-PRESETS = [
-    _preset("", "Instant-NGP on photographs composited on white", {}),
-    _preset("+mask", "Instant-NGP with the paper's silhouette loss, weight 0.1", MASK),
-    _preset("+vd", "Instant-NGP with rays confined to the visible domain, and the silhouette loss", VD),
-]

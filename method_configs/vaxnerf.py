@@ -9,30 +9,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from method_configs.ingp import FULL, QUICK
+from method_configs import ingp
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hull.domain import TRAINING_DOMAIN
-from visdom_plugin.registry import Preset
+from visdom_plugin.registry import MethodSpec
 
 SAMPLER = SamplerConfig(enabled=True, epsilon_world=0.0, missing="skip", drop_outside=True)
 HULL = replace(TRAINING_DOMAIN, kind="unit-sphere")
 
-
-def _preset(suffix: str, description: str, sampler: SamplerConfig) -> Preset:
-    return Preset(
-        name=f"vaxnerf{suffix}",
-        description=description,
-        target="visdom_plugin.methods.fields.ingp:Ingp",
-        quick=replace(QUICK, hull=HULL, vd=sampler),
-        full=replace(FULL, hull=HULL, vd=sampler),
-    )
-
-
-PRESETS = [
-    _preset(
-        "", "VaxNeRF on Instant-NGP: trained inside a traditional hull in a ball, rendered without", SAMPLER
-    ),
-    _preset(
-        "+hull", "the same field, rendered inside the hull, too", replace(SAMPLER, hull_at_inference=True)
-    ),
-]
+SPEC = MethodSpec(
+    "vaxnerf",
+    ingp.SPEC.target,
+    quick=replace(ingp.SPEC.quick, hull=HULL, vd=SAMPLER),
+    full=replace(ingp.SPEC.full, hull=HULL, vd=SAMPLER),
+    description="VaxNeRF on Instant-NGP: trained inside a traditional hull in a ball, rendered without",
+    variants={"hull": {"vd": replace(SAMPLER, hull_at_inference=True)}},
+    descriptions={"hull": "the same field, rendered inside the hull, too"},
+)

@@ -9,8 +9,9 @@ import pickle
 import re
 import subprocess
 import sys
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import EntryPoint, entry_points
+from typing import ClassVar
 
 import pytest
 
@@ -18,7 +19,15 @@ from visdom_plugin.cli.methods_doctor import examine
 from visdom_plugin.errors import ConfigError, PluginError
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.registry import GROUP, MethodSpec, Preset, Registry, discover
+from visdom_plugin.registry import (
+    GROUP,
+    GaussianMethodConfig,
+    MethodSpec,
+    Preset,
+    Registry,
+    SamplerMethodConfig,
+    discover,
+)
 from visdom_plugin.training.runs.config_io import as_plain, from_plain
 
 
@@ -92,7 +101,7 @@ def test_a_missing_class_names_the_method_and_the_target():
 
 def test_the_built_in_methods_come_by_the_entry_point():
     values = {p.value for p in entry_points(group=GROUP) if p.dist and p.dist.name == "visdom-plugin"}
-    assert "method_configs.gs_go:PRESETS" in values
+    assert "method_configs.gs_go:SPEC" in values
     found = discover()
     assert {"3dgs-go", "3dgs-go+mask", "3dgs-go+vd"} <= set(found.presets)
     for name, origin in found.origins.items():
@@ -101,8 +110,8 @@ def test_the_built_in_methods_come_by_the_entry_point():
             assert preset.load() and preset.description and type(preset.quick) is type(preset.full)
 
 
-@dataclass
-class Plain:
+@dataclass(frozen=True)
+class Plain(SamplerMethodConfig):
     """A stranger's settings.
 
     Attributes:
@@ -114,33 +123,41 @@ class Plain:
 
 
 @dataclass(frozen=True)
-class Frozen:
+class OwnWeight(GaussianMethodConfig):
     steps: int = 7
     mask_weight: float = 0.25
     """Its own."""
+
+
+@dataclass
+class Bare:
+    """Without the fields in which variants differ."""
+
+    steps: int = 7
 
 
 TARGET = "tests.training.fake:FakeMethod"
 SPEC = MethodSpec("mine", TARGET, Plain(3), full=Plain(64, steps=900), hook="sampler", aliases=("my",))
 
 
-@pytest.mark.parametrize("hook", ["sampler", "gaussian"])
-@pytest.mark.parametrize("config", [Plain(3), Frozen()], ids=["plain", "frozen"])
+@pytest.mark.parametrize(
+    ("hook", "config"), [("sampler", Plain(3)), ("gaussian", OwnWeight())], ids=["plain", "own weight"]
+)
 def test_a_method_that_says_its_hook_gets_all_variants_with_one_class_of_settings(hook, config):
     spec = MethodSpec("m", TARGET, config, hook=hook)
     bare, mask, vd = (spec.presets()[f"m{suffix}"].quick for suffix in ("", "+mask", "+vd"))
-    assert type(bare) is type(mask) is type(vd) and isinstance(bare, type(config))
+    assert type(bare) is type(mask) is type(vd) is type(config)
     for f in fields(config):
-        if f.name != "mask_weight":
+        if f.name not in ("mask_weight", "hull", "vd"):
             assert getattr(bare, f.name) == getattr(vd, f.name) == getattr(config, f.name)
-    assert bare.mask_weight == getattr(config, "mask_weight", 0) and mask.mask_weight == vd.mask_weight == 0.1
+    assert bare.mask_weight == config.mask_weight and mask.mask_weight == vd.mask_weight == 0.1
     assert bare.hull is mask.hull is None and isinstance(vd.hull, VisibleDomain)
     settings = {"sampler": SamplerConfig, "gaussian": RegularizerConfig}[hook]
     assert bare.vd == mask.vd == settings() and vd.vd == settings(enabled=True)
     assert {p.hook for p in spec.presets().values()} == {hook}
 
 
-def test_settings_with_fields_added_are_data_as_any_other():
+def test_settings_with_inherited_fields_are_data_as_any_other():
     bare, vd = (SPEC.presets()[name].full for name in ("mine", "mine+vd"))
     for twin in (
         copy.deepcopy(vd),
@@ -154,26 +171,27 @@ def test_settings_with_fields_added_are_data_as_any_other():
 
 
 @dataclass(frozen=True)
-class Strict:
+class Strict(SamplerMethodConfig):
     """Checks itself."""
 
     steps: int = 7
 
     def __post_init__(self):
+        super().__post_init__()
         if self.steps < 1:
             raise ConfigError("steps is below 1")
 
 
 @dataclass(frozen=True)
 class Dropping(Strict):
-    """Has settings of the hook of its own."""
+    """Says that its method drops single samples."""
 
-    vd: SamplerConfig = field(default_factory=SamplerConfig)
+    drops_samples: ClassVar[bool] = True
 
 
 def test_dropping_samples_is_refused_where_the_method_does_not_say_that_it_does():
     on = SamplerConfig(enabled=True, drop_outside=True)
-    for config in (Plain(3), Frozen(), Strict()):
+    for config in (Plain(3), Strict()):
         vd = MethodSpec("m", TARGET, config, hook="sampler").presets()["m+vd"].quick
         with pytest.raises(ConfigError, match="drop_outside") as caught:
             replace(vd, vd=on)
@@ -184,15 +202,36 @@ def test_dropping_samples_is_refused_where_the_method_does_not_say_that_it_does(
     assert replace(preset.quick, vd=on).vd.drop_outside
 
 
-def test_settings_with_fields_added_are_checked_as_before():
+def test_settings_with_inherited_fields_are_checked():
     for preset in MethodSpec("m", TARGET, Strict(), hook="sampler").presets().values():
         with pytest.raises(ConfigError, match="below 1"):
             replace(preset.quick, steps=0)
+        with pytest.raises(ConfigError, match="mask_weight = -1"):
+            replace(preset.quick, mask_weight=-1)
+    for vd in (SamplerConfig(enabled=True), SamplerConfig(hull_at_inference=True)):
+        with pytest.raises(ConfigError, match="no hull to go with it"):
+            Strict(vd=vd)
 
 
 def test_a_method_without_a_hook_stays_as_it_is():
-    (preset,) = MethodSpec("m", TARGET, Plain(3)).presets().values()
-    assert type(preset.quick) is Plain and preset.full is preset.quick and preset.hook is None
+    (preset,) = MethodSpec("m", TARGET, Bare()).presets().values()
+    assert type(preset.quick) is Bare and preset.full == preset.quick and preset.hook is None
+
+
+def test_a_method_without_a_hook_has_the_variants_it_names():
+    spec = MethodSpec(
+        "m", TARGET, Bare(), variants={"long": {"steps": 70}}, descriptions={"long": "more steps"}
+    )
+    presets = spec.presets()
+    assert {name: p.quick.steps for name, p in presets.items()} == {"m": 7, "m+long": 70}
+    assert presets["m+long"].description == "more steps"
+
+
+def test_a_variant_may_change_the_quick_settings_alone():
+    presets = replace(SPEC, variants={"vd": {"steps": 5}}, quick_variants={"vd": {"width": 2}}).presets()
+    vd = presets["mine+vd"]
+    assert (vd.quick.width, vd.full.width) == (2, 64) and vd.quick.steps == vd.full.steps == 5
+    assert presets["mine"].quick.width == presets["mine+mask"].quick.width == 3
 
 
 def test_variants_may_change_more_and_full_keeps_its_own():
@@ -214,7 +253,10 @@ def test_variants_may_change_more_and_full_keeps_its_own():
         ({"target": Plain}, "target is"),
         ({"quick": Plain}, "quick is the class Plain"),
         ({"full": {"steps": 3}}, "full is dict"),
-        ({"full": Frozen()}, "different classes"),
+        ({"full": OwnWeight()}, "different classes"),
+        ({"quick": Bare(), "full": None}, "Bare lacks mask_weight, hull, vd"),
+        ({"hook": "gaussian"}, "field vd is SamplerConfig"),
+        ({"quick_variants": {"vd": {"widht": 3}}}, "sets 'widht'"),
         ({"hook": "samplr"}, "no hook 'samplr'"),
         ({"variants": {"+vd": {}}}, "no variant '+vd'"),
         ({"variants": {"vd": {"widht": 3}}}, "sets 'widht'"),
@@ -247,9 +289,9 @@ def test_the_variable_cannot_take_a_name_either():
 STRANGER = """
 import {heavy}
 from dataclasses import dataclass
-from visdom_plugin.registry import MethodSpec
-@dataclass
-class Config:
+from visdom_plugin.registry import MethodSpec, SamplerMethodConfig
+@dataclass(frozen=True)
+class Config(SamplerMethodConfig):
     steps: int = 3
 SPEC = MethodSpec("strange", "heavy_method:Method", Config(), hook="sampler", description="A strange one")
 """

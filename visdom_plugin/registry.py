@@ -22,14 +22,17 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from visdom_plugin.errors import ConfigError, PluginError
+from visdom_plugin.hooks.configs import GaussianMethodConfig, SamplerMethodConfig
 from visdom_plugin.specs import MethodSpec, Preset
 
 __all__ = [
     "GROUP",
     "VARIABLE",
+    "GaussianMethodConfig",
     "MethodSpec",
     "Preset",
     "Registry",
+    "SamplerMethodConfig",
     "Skipped",
     "discover",
     "find",
@@ -209,10 +212,9 @@ def _take(found: Registry, point: EntryPoint, origin: str) -> None:
 
 
 def _explain(error: BaseException, point: EntryPoint, origin: str) -> Skipped:
-    ours = isinstance(error, PluginError)
-    reason = error.what if ours else f"{type(error).__name__}: {error}"
+    reason = error.what if isinstance(error, PluginError) else f"{type(error).__name__}: {error}"
     lookup = f"see that {point.value.partition(':')[0]} can be imported and is of a version that fits"
-    if ours and error.todo:
+    if isinstance(error, PluginError) and error.todo:
         todo = error.todo
     elif origin == VARIABLE:
         todo = (

@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
-from functools import cache
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from importlib import import_module
 from typing import Any, Literal
 
-from visdom_plugin.errors import ConfigError, PluginError
+from visdom_plugin.errors import PluginError
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
-from visdom_plugin.hull.domain import TRAINING_DOMAIN, VisibleDomain
+from visdom_plugin.hull.domain import TRAINING_DOMAIN
 
 HOOKS = {"sampler": SamplerConfig, "gaussian": RegularizerConfig}
 """By the hook a method takes, the settings of that hook."""
 MEMBERS = ("setup", "train_step", "optimise", "render", "state_dict", "load_state_dict", "export")
 """What a method's class must offer; `training.protocols.Method` says what each does."""
+MADE = {
+    "mask": "with the silhouette loss",
+    "vd": "in the visible domain: the hook, and the silhouette loss",
+}
+"""The variants that a method with a hook has, and what they say of themselves."""
 MASK_WEIGHT = 0.1
 """The paper's weight of the silhouette loss."""
 
@@ -86,14 +90,12 @@ class MethodSpec:
     is imported when it is trained.
 
     With a hook, the method comes in three variants: `name`, `name+mask` and `name+vd`. They differ in three
-    fields of the config. A config that does not have them gets them, by way of a subclass, so that all variants
-    are constructed with the same class; the method reads
+    fields of the config, which inherits them of `SamplerMethodConfig` or `GaussianMethodConfig`; the method reads
 
         config.mask_weight   0, and 0.1 in +mask and +vd: the weight of `losses.mask_loss(alpha, batch.mask)`
         config.hull          None, and the VisibleDomain to carve in +vd; the hull arrives in `setup`
         config.vd            the hook's settings, off but in +vd; the hook itself arrives in `setup(hooks=[...])`
 
-    Single samples few methods drop: `vd.drop_outside` is refused, unless the config has a field `vd` of its own.
     `visdom_plugin.hooks.protocols` says what the two kinds of hook do and what is expected of a method.
 
     Raises:
@@ -113,7 +115,12 @@ class MethodSpec:
     description: str = ""
     """One line for lists and help."""
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """What a variant changes besides, by "mask" or "vd" and the config's field."""
+    """What a variant changes besides, by "mask" or "vd" and the config's field. A method without a hook has no
+    other variants than those named here."""
+    quick_variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """The same for the quick settings alone."""
+    descriptions: Mapping[str, str] = field(default_factory=dict)
+    """One line for a variant, in place of the one made from `description`."""
     aliases: tuple[str, ...] = ()
     """Other names for it."""
 
@@ -140,126 +147,51 @@ class MethodSpec:
         demand(same, "quick and full are of different classes", "use one config dataclass for both")
         known = self.hook is None or self.hook in HOOKS
         demand(known, f"there is no hook {self.hook!r}", f"choose one of {', '.join(HOOKS)}, or None")
+        names = {f.name for f in fields(self.quick)}
         if self.hook is not None:
-            vd = getattr(self.quick, "vd", None)
-            fits = vd is None or isinstance(vd, HOOKS[self.hook]) or hasattr(vd, "build")
+            base = f"{self.hook.capitalize()}MethodConfig"
+            lacks = [name for name in ("mask_weight", "hull", "vd") if name not in names]
             demand(
-                fits,
-                f"the config's field vd is {type(vd).__name__}",
-                f"use {HOOKS[self.hook].__name__}, or none",
+                not lacks,
+                f"the config {type(self.quick).__name__} lacks {', '.join(lacks)}",
+                f"let it inherit visdom_plugin.registry.{base}, which has mask_weight, hull and vd",
             )
-        for suffix, changes in self.variants.items():
+            vd = self.quick.vd
+            fits = isinstance(vd, HOOKS[self.hook]) or (
+                type(vd) not in HOOKS.values() and hasattr(vd, "build")
+            )
+            demand(fits, f"the config's field vd is {type(vd).__name__}", f"use {HOOKS[self.hook].__name__}")
+        for suffix, changes in (*self.variants.items(), *self.quick_variants.items()):
+            fine = isinstance(suffix, str) and re.fullmatch(r"[A-Za-z0-9][\w.-]*", suffix)
             demand(
-                suffix in ("mask", "vd") and self.hook is not None,
+                bool(fine) and (suffix in MADE) == (self.hook is not None),
                 f"there is no variant {suffix!r}",
-                'variants are "mask" and "vd", of a method with a hook',
+                'variants are "mask" and "vd" of a method with a hook, and any others of one without',
             )
-            names = {f.name for f in fields(self._extend(self.quick))}
             for name in changes:
                 demand(name in names, f"variant {suffix!r} sets {name!r}, which the config lacks", "add it")
 
     def presets(self) -> dict[str, Preset]:
         """The variants by name, and by alias."""
-        bare = Preset(
-            self.name,
-            self.description,
-            self.target,
-            self._extend(self.quick),
-            self._extend(self.full),
-            self.hook,
-        )
-        made = {self.name: bare}
-        if self.hook is not None:
-            texts = {
-                "mask": "with the silhouette loss",
-                "vd": "in the visible domain: the hook, and the silhouette loss",
-            }
-            for suffix, text in texts.items():
-                configs = (self._change(config, suffix) for config in (bare.quick, bare.full))
-                name = f"{self.name}+{suffix}"
-                what = f"{self.description or self.name}, {text}"
-                made[name] = Preset(name, what, self.target, *configs, self.hook)
+        made: dict[str, Preset] = {}
+        for suffix in ("", *(self.variants if self.hook is None else MADE)):
+            name = f"{self.name}+{suffix}" if suffix else self.name
+            text = self.description
+            if suffix:
+                made_up = f"{text or self.name}, {MADE.get(suffix, suffix)}"
+                text = self.descriptions.get(suffix, made_up)
+            quick = replace(self._vary(self.quick, suffix), **self.quick_variants.get(suffix, {}))
+            made[name] = Preset(name, text, self.target, quick, self._vary(self.full, suffix), self.hook)
         for alias in self.aliases:
             made |= {name.replace(self.name, alias, 1): p for name, p in list(made.items()) if name == p.name}
         return made
 
-    def _extend(self, config: Any) -> Any:
-        if self.hook is None:
-            return config
-        values = {f.name: getattr(config, f.name) for f in fields(config) if f.init}
-        try:
-            return extend(type(config), self.hook)(**values)
-        except TypeError as error:
-            raise PluginError(
-                f"the config {type(config).__name__} cannot be given the fields mask_weight, hull and vd: {error}",
-                where=f"MethodSpec {self.name!r}",
-                todo="make it a plain dataclass, or give it these three fields",
-            ) from error
-
-    def _change(self, config: Any, suffix: str) -> Any:
-        changes: dict[str, Any] = {"mask_weight": MASK_WEIGHT}
+    def _vary(self, config: Any, suffix: str) -> Any:
+        changes: dict[str, Any] = {}
+        if suffix in MADE:
+            changes["mask_weight"] = MASK_WEIGHT
         if suffix == "vd":
             changes["hull"] = TRAINING_DOMAIN
-            changes["vd"] = replace(HOOKS[self.hook](), enabled=True)
-            if is_dataclass(config.vd):
-                changes["vd"] = replace(config.vd, enabled=True)
+            vd = config.vd if is_dataclass(config.vd) else HOOKS[self.hook or ""]()
+            changes["vd"] = replace(vd, enabled=True)
         return replace(config, **changes | dict(self.variants.get(suffix, {})))
-
-
-@cache
-def extend(config_class: type, hook: str) -> type:
-    """The config class with the fields that the variants set; the class itself where it has them all.
-
-    Instances of the result are instances of `config_class`, can be pickled, and are constructed alike. With a
-    field `vd` that is added, they refuse `drop_outside`, which needs more of a method than to bound its rays.
-    """
-    own = {f.name for f in fields(config_class)}
-    settings = HOOKS[hook]
-    offered = (
-        ("mask_weight", float, field(default=0.0)),
-        ("hull", VisibleDomain | None, field(default=None)),
-        ("vd", settings, field(default=settings())),
-    )
-    added = [item for item in offered if item[0] not in own]
-    if not added:
-        return config_class
-
-    def check(self: Any, *rest: Any) -> None:
-        if hasattr(config_class, "__post_init__"):
-            config_class.__post_init__(self, *rest)
-        if "vd" not in own and getattr(self.vd, "drop_outside", False):
-            raise ConfigError(
-                "vd.drop_outside is on, but the method does not say that it drops single samples",
-                where=f"{config_class.__name__}, --method.vd.drop-outside",
-                todo="leave it off, or train method:vaxnerf; a method that asks the hook's keep() about each "
-                "sample says so by a field vd: SamplerConfig in its config",
-            )
-
-    documents = {
-        "mask_weight": "Weight of the binary cross entropy between rendered opacity and mask.",
-        "hull": "The hull of the visible-domain hook; carved when there is one.",
-        "vd": "The visible-domain hook.",
-    }
-    extended = make_dataclass(
-        config_class.__name__,
-        added,
-        bases=(config_class,),
-        frozen=config_class.__dataclass_params__.frozen,
-        kw_only=True,
-        namespace={
-            "__post_init__": check,
-            "__reduce__": lambda self: (
-                _rebuild,
-                (config_class, hook, {f.name: getattr(self, f.name) for f in fields(self) if f.init}),
-            ),
-        },
-    )
-    extended.__module__, extended.__qualname__ = config_class.__module__, config_class.__qualname__
-    head = (config_class.__doc__ or f"{config_class.__name__}.").rstrip()
-    lines = "".join(f"\n        {name}: {documents[name]}" for name, *_ in added)
-    extended.__doc__ = f"{head}\n\n    Attributes:{lines}\n"
-    return extended
-
-
-def _rebuild(config_class: type, hook: str, values: dict[str, Any]) -> Any:
-    return extend(config_class, hook)(**values)

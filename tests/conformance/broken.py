@@ -5,7 +5,8 @@ Named by VISDOM_METHODS, as a stranger's code is before it is installed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.splats.gs_go import GsGo
 from visdom_plugin.nerf.encoding.hash_layout import HashLayout
-from visdom_plugin.registry import MethodSpec, Preset
+from visdom_plugin.registry import MethodSpec, Preset, SamplerMethodConfig
 
 HULL = VisibleDomain(resolution=48, dilate_px=1)
 BROKEN: dict[str, str] = {}
@@ -37,7 +38,7 @@ def breaks(check: str, vd: type | None = None):
 
 
 @dataclass(frozen=True)
-class TinyField:
+class TinyField(SamplerMethodConfig):
     steps: int = 24
     rays: int = 96
     samples: int = 16
@@ -47,9 +48,9 @@ class TinyField:
 
 @dataclass(frozen=True)
 class DroppingField(TinyField):
-    """Says of its method that it drops single samples: it has the hook's settings of its own."""
+    """Says of its method that it drops single samples."""
 
-    vd: SamplerConfig = field(default_factory=SamplerConfig)
+    drops_samples: ClassVar[bool] = True
 
 
 class Field(WholeField):
@@ -310,7 +311,7 @@ def _field_spec(name: str, target: str, settings: type, vd: type | None) -> Meth
 
 def _splat_presets(name: str, target: str, module) -> list[Preset]:
     small = {"steps": 24, "initial_points": 400, "max_gaussians": 600}
-    bare = replace(module.QUICK, **small, mask_weight=0.0)
+    bare = replace(module.SPEC.quick, **small, mask_weight=0.0)
     regularizer = RegularizerConfig(enabled=True, weight=0.1, prune_every=10, bank=4)
     # Wide, as the bare methods' hull is: it is the losses' doing that opacity falls.
     vd = replace(bare, mask_weight=1.0, hull=HULL, vd=regularizer, lr_opacity=0.1)
@@ -318,8 +319,8 @@ def _splat_presets(name: str, target: str, module) -> list[Preset]:
 
 
 def _field_presets(name: str, target: str, module, **small) -> list[Preset]:
-    bare = replace(module.QUICK, **small)
-    vd = replace(bare, **module.MASK, hull=HULL, vd=SamplerConfig(enabled=True))
+    bare = replace(module.SPEC.quick, **small)
+    vd = replace(bare, mask_weight=0.1, background="random", hull=HULL, vd=SamplerConfig(enabled=True))
     return [Preset(name, "", target, bare, bare), Preset(f"{name}+vd", "", target, vd, vd)]
 
 

@@ -20,15 +20,15 @@ from visdom_plugin.training.run import choose_batches
 
 GRID = HashLayout(3, 1, base_resolution=8, max_resolution=32, log2_table_size=10)
 SPLATS = {
-    GsGo: replace(gs_go.QUICK, steps=40, initial_points=300, depth_weight=0.0),
-    CorgsLite: replace(corgs_lite.QUICK, steps=40, initial_points=300),
+    GsGo: replace(gs_go.SPEC.quick, steps=40, initial_points=300, depth_weight=0.0),
+    CorgsLite: replace(corgs_lite.SPEC.quick, steps=40, initial_points=300),
 }
 METHODS = SPLATS | {
     Ingp: replace(
-        ingp.QUICK, steps=40, max_rays=128, samples_per_step=1 << 10, grid=replace(GRID, features=2)
+        ingp.SPEC.quick, steps=40, max_rays=128, samples_per_step=1 << 10, grid=replace(GRID, features=2)
     ),
     ZipNerfLite: replace(
-        zipnerf_lite.QUICK,
+        zipnerf_lite.SPEC.quick,
         steps=40,
         rays=64,
         coarse_grid=GRID,

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from datamodules.synthetic.scene import SyntheticConfig, make_scene
-from method_configs.gs_go import QUICK
+from method_configs.gs_go import SPEC
 from visdom_plugin.errors import SceneError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
@@ -139,7 +139,7 @@ def test_masks_that_only_test_views_lack_need_no_hull(whole):
 
 
 def train(scene, hull, steps):
-    config = replace(QUICK, steps=steps, initial_points=1500, hull=DOMAIN)
+    config = replace(SPEC.quick, steps=steps, initial_points=1500, hull=DOMAIN)
     method = GsGo(config)
     method.setup(scene.train, [], hull=hull, device=CPU, seed=0)
     data = DataManager(scene.train, 0)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.validation import demand
 
 if TYPE_CHECKING:
     from visdom_plugin.hooks.regularizer import VisDomGaussianRegularizer
@@ -70,3 +74,51 @@ class RegularizerConfig:
         from visdom_plugin.hooks.regularizer import VisDomGaussianRegularizer
 
         return VisDomGaussianRegularizer(hull, views.cameras, self, images=views.images)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodConfig:
+    """The settings in which a method's variants differ; a method's own config inherits one of the two below."""
+
+    mask_weight: float = 0.0
+    """Weight of the binary cross entropy between rendered opacity and mask."""
+    hull: VisibleDomain | None = None
+    """The hull of the visible-domain hook; carved when there is one."""
+
+    def __post_init__(self) -> None:
+        demand(self, {"mask_weight": (self.mask_weight >= 0, "0 or more")})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplerMethodConfig(MethodConfig):
+    """Settings of a method that takes rays' bounds from VisDomSampler."""
+
+    vd: SamplerConfig = field(default_factory=SamplerConfig)
+    """The visible-domain hook."""
+    drops_samples: ClassVar[bool] = False
+    """Whether the method asks the hook's `keep` about each sample; without, `vd.drop_outside` is refused."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        where = f"{type(self).__name__}, --method.vd"
+        if self.hull is None and (self.vd.enabled or self.vd.hull_at_inference):
+            raise ConfigError(
+                "the visible-domain hook is asked for, but no hull to go with it",
+                where=where,
+                todo="start from the variant +vd, which has both",
+            )
+        if self.vd.drop_outside and not self.drops_samples:
+            raise ConfigError(
+                "vd.drop_outside is on, but the method does not say that it drops single samples",
+                where=f"{where}.drop-outside",
+                todo="leave it off, or train method:vaxnerf; a method that asks the hook's keep() about each "
+                "sample says so in its config: drops_samples: ClassVar[bool] = True",
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussianMethodConfig(MethodConfig):
+    """Settings of a method that takes points and losses from VisDomGaussianRegularizer."""
+
+    vd: RegularizerConfig = field(default_factory=RegularizerConfig)
+    """The visible-domain hook."""

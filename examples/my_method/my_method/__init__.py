@@ -1,10 +1,10 @@
 from dataclasses import dataclass
 
-from visdom_plugin.registry import MethodSpec
+from visdom_plugin.registry import MethodSpec, SamplerMethodConfig
 
 
 @dataclass(frozen=True)
-class Config:  # mask_weight, hull and vd are added
+class Config(SamplerMethodConfig):  # which has mask_weight, hull and vd
     steps: int = 300
     rays: int = 512  # per step
     samples: int = 48  # along each ray

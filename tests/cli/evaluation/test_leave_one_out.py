@@ -95,11 +95,13 @@ def test_the_held_out_view_reaches_nothing(fold):
 
 def test_nothing_of_a_real_method_knows_the_held_out_view():
     """Frame, bounds and start of Instant-NGP, from a capture whose held-out view was moved away and inverted."""
-    from method_configs.ingp import QUICK
+    from method_configs.ingp import SPEC
     from visdom_plugin.methods.fields.ingp import Ingp
 
     scene = fake.tiny_scene()
-    config = replace(QUICK, occupancy_resolution=16, hidden=8, grid=replace(QUICK.grid, log2_table_size=8))
+    config = replace(
+        SPEC.quick, occupancy_resolution=16, hidden=8, grid=replace(SPEC.quick.grid, log2_table_size=8)
+    )
     states = []
     for whole, index in ((scene, 2), (_poisoned(scene, 2), 2), (_poisoned(scene, 2), 1)):
         views = hold_out(whole, index).train

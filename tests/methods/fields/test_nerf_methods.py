@@ -26,7 +26,7 @@ from visdom_plugin.training.batches import DataManager
 HULL = VisibleDomain(resolution=48, dilate_px=1)
 SMALL = {
     Ingp: replace(
-        ingp.QUICK,
+        ingp.SPEC.quick,
         steps=240,
         max_rays=256,
         samples_per_step=1 << 12,
@@ -42,7 +42,7 @@ SMALL = {
         vd=SamplerConfig(enabled=True),
     ),
     ZipNerfLite: replace(
-        zipnerf_lite.QUICK,
+        zipnerf_lite.SPEC.quick,
         steps=240,
         rays=128,
         samples=(12, 12, 8),

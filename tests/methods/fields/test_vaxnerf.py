@@ -8,7 +8,7 @@ import torch
 
 from datamodules.synthetic.scene import SyntheticConfig, make_scene
 from method_configs import vaxnerf, zipnerf_lite
-from method_configs.ingp import FULL, QUICK
+from method_configs.ingp import SPEC
 from tests.methods.fields.test_nerf_methods import SMALL, advance, start
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.sampler import VisDomSampler
@@ -123,17 +123,17 @@ def test_the_filter_is_the_hull(shards):
 
 
 def test_the_presets_are_ingp_with_a_hull_and_its_filter():
-    star = vaxnerf.PRESETS
+    star = list(vaxnerf.SPEC.presets().values())
     for preset in star:
-        for config, base in ((preset.quick, QUICK), (preset.full, FULL)):
+        for config, base in ((preset.quick, SPEC.quick), (preset.full, SPEC.full)):
             assert replace(config, hull=None, vd=base.vd) == base
             assert (
                 config.vd.drop_outside and config.vd.missing == "skip" and config.hull.kind == "unit-sphere"
             )
     assert [p.quick.vd.hull_at_inference for p in star] == [False, True]
-    assert star[0].load() is Ingp
+    assert [p.name for p in star] == ["vaxnerf", "vaxnerf+hull"] and star[0].load() is Ingp
 
 
 def test_other_methods_refuse_the_filter():
     with pytest.raises(ConfigError, match="drop_outside"):
-        replace(zipnerf_lite.QUICK, hull=vaxnerf.HULL, vd=vaxnerf.SAMPLER)
+        replace(zipnerf_lite.SPEC.quick, hull=vaxnerf.HULL, vd=vaxnerf.SAMPLER)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datamodules.synthetic.scene import SyntheticConfig, make_scene
-from method_configs.corgs_lite import PRESETS, QUICK
+from method_configs.corgs_lite import SPEC
 from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.camera_paths import look_at_camera
@@ -23,7 +23,7 @@ from visdom_plugin.training.batches import DataManager
 
 CPU = torch.device("cpu")
 SMALL = replace(
-    QUICK,
+    SPEC.quick,
     steps=60,
     initial_points=500,
     densify_from=8,
@@ -339,8 +339,8 @@ def test_one_view_is_refused(scene, hull):
 
 
 def test_presets_differ_only_in_what_they_name():
-    bare, mask, vd = (PRESETS[f"corgs{suffix}"] for suffix in ("", "+mask", "+vd"))
-    assert PRESETS["corgs-lite+vd"] is vd
+    bare, mask, vd = (SPEC.presets()[f"corgs{suffix}"] for suffix in ("", "+mask", "+vd"))
+    assert SPEC.presets()["corgs-lite+vd"] == vd
     for budget in ("quick", "full"):
         base = getattr(bare, budget)
         assert replace(getattr(mask, budget), mask_weight=base.mask_weight) == base

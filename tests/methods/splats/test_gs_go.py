@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from datamodules.synthetic.scene import SyntheticConfig, make_scene
-from method_configs.gs_go import PRESETS, QUICK
+from method_configs.gs_go import SPEC
 from tests.methods.short_runs import advance, set_up
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
@@ -15,7 +15,7 @@ from visdom_plugin.methods.splats.gs_go import GsGo
 from visdom_plugin.methods.splats.initial_points import mean_masked_colour
 
 SMALL = replace(
-    QUICK,
+    SPEC.quick,
     steps=60,
     initial_points=600,
     densify_from=10,
@@ -131,7 +131,7 @@ def test_extent_and_colour_agree_with_their_definitions(scene):
 
 
 def test_presets_differ_only_in_what_they_name():
-    bare, mask, vd = PRESETS
+    bare, mask, vd = SPEC.presets().values()
     for budget in ("quick", "full"):
         base = getattr(bare, budget)
         assert replace(getattr(mask, budget), mask_weight=base.mask_weight) == base

@@ -76,8 +76,10 @@ def test_every_number_has_a_range(kind):
 
 
 def test_what_is_switched_off_is_in_range():
-    replace(corgs_lite.QUICK, pseudo_every=0, co_prune_every=0, opacity_reset_every=0, co_prune_world=None)
-    replace(gs_go.QUICK, floater_every=0, opacity_reset_every=0, depth_weight=0.0, densify_gradient=0.0)
+    replace(
+        corgs_lite.SPEC.quick, pseudo_every=0, co_prune_every=0, opacity_reset_every=0, co_prune_world=None
+    )
+    replace(gs_go.SPEC.quick, floater_every=0, opacity_reset_every=0, depth_weight=0.0, densify_gradient=0.0)
 
 
 @pytest.mark.parametrize(

@@ -3,32 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
-from visdom_plugin.errors import ConfigError
-from visdom_plugin.hooks.configs import SamplerConfig
-from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hooks.configs import SamplerMethodConfig
 from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 from visdom_plugin.validation import demand
 
 
-def _demand_hull(config: IngpConfig | ZipNerfConfig) -> None:
-    if config.hull is None and (config.vd.enabled or config.vd.hull_at_inference):
-        raise ConfigError(
-            "the visible-domain hook is asked for, but no hull to go with it",
-            where=type(config).__name__,
-            todo="start from the variant +vd, which has both",
-        )
-    if config.vd.drop_outside and not isinstance(config, IngpConfig):
-        raise ConfigError(
-            "vd.drop_outside is on, but only Instant-NGP drops single samples",
-            where=f"{type(config).__name__}, --method.vd.drop-outside",
-            todo="leave it off, or train method:vaxnerf",
-        )
-
-
 @dataclass(frozen=True)
-class IngpConfig:
+class IngpConfig(SamplerMethodConfig):
     """Instant-NGP (Müller et al. 2022). Lengths are in mean camera distances unless their name says otherwise.
 
     The field fills the cube of half side `half_side` around the training cameras' look-at point.
@@ -73,9 +56,6 @@ class IngpConfig:
     drop_unsampled: bool = True
     """Cells that no training ray samples, given its bounds, stay empty for ever (Instant-NGP: that none sees)."""
 
-    mask_weight: float = 0.0
-    """lambda_1, binary cross entropy between rendered opacity and mask."""
-
     lr: float = 0.01
     lr_warm_up: int = 100
     lr_factor: float = 0.33
@@ -83,12 +63,10 @@ class IngpConfig:
     weight_decay: float = 1e-6
     """Of the networks, not of the hash table."""
 
-    hull: VisibleDomain | None = None
-    """The hull of the visible-domain hook; carved when there is one."""
-    vd: SamplerConfig = field(default_factory=SamplerConfig)
-    """The visible-domain hook."""
+    drops_samples: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         positive = ("half_side", "step_length", "missing_step_length", "lr", "occupancy_alpha")
         counts = (
             "max_rays",
@@ -106,15 +84,13 @@ class IngpConfig:
                 "steps": (self.steps >= 0, "0 or more"),
                 "near": (self.near >= 0, "0 or more"),
                 "view_degree": (0 <= self.view_degree <= 4, "0 to 4"),
-                "mask_weight": (self.mask_weight >= 0, "0 or more"),
                 "occupancy_fraction": (0 < self.occupancy_fraction <= 1, "a share above 0, at most 1"),
             },
         )
-        _demand_hull(self)
 
 
 @dataclass(frozen=True)
-class ZipNerfConfig:
+class ZipNerfConfig(SamplerMethodConfig):
     """Zip-NeRF (Barron et al. 2023) on one device. Lengths are in mean camera distances.
 
     Defaults are the published ones for a single GPU (camp_zipnerf).
@@ -159,8 +135,6 @@ class ZipNerfConfig:
     density_bias: float = -1.0
     """density = exp(x + bias), per camera distance."""
 
-    mask_weight: float = 0.0
-    """lambda_1, binary cross entropy between rendered opacity and mask."""
     interlevel_weight: float = 0.01
     distortion_weight: float = 0.01
     hash_decay: float = 0.1
@@ -174,14 +148,10 @@ class ZipNerfConfig:
     lr_warm_up: int = 20_000
     lr_delay: float = 1e-8
 
-    hull: VisibleDomain | None = None
-    """The hull of the visible-domain hook; carved when there is one."""
-    vd: SamplerConfig = field(default_factory=SamplerConfig)
-    """The visible-domain hook."""
-
     def __post_init__(self) -> None:
+        super().__post_init__()
         counts = ("rays", "hidden", "bottleneck", "colour_hidden", "colour_layers")
-        weights = ("mask_weight", "interlevel_weight", "distortion_weight", "hash_decay")
+        weights = ("interlevel_weight", "distortion_weight", "hash_decay")
         positive = ("lr", "lr_final", "anneal_slope")
         demand(
             self,
@@ -198,4 +168,3 @@ class ZipNerfConfig:
                 "view_degree": (self.view_degree >= 0, "0 or more"),
             },
         )
-        _demand_hull(self)
