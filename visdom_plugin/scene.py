@@ -41,6 +41,8 @@ class Views:
     origin: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
     """(3,) float64: where the origin of the cameras' frame lies in the capture's own, which has the same axes.
     What is written for others is in the capture's own frame."""
+    points: tuple[Tensor, Tensor] | None = None
+    """The scene's points where training is to start from them: `Scene.points`, in the cameras' frame."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -68,13 +70,16 @@ class Views:
             chosen(self.ignore),
             chosen(self.mask_origins),
             self.origin,
+            self.points,
         )
 
     def relative_to(self, origin: Tensor) -> Views:
         """The same views in the frame that has its origin at `origin` (3,) float64; themselves for zero."""
         if not origin.any():
             return self
-        return replace(self, cameras=self.cameras.relative_to(origin), origin=self.origin + origin)
+        points = None if self.points is None else (self.points[0] - origin, self.points[1])
+        cameras = self.cameras.relative_to(origin)
+        return replace(self, cameras=cameras, origin=self.origin + origin, points=points)
 
     def silhouettes(self) -> tuple[Cameras, Sequence[Tensor]]:
         """What may carve: the cameras and masks of the views whose mask was given.

@@ -192,6 +192,6 @@ class MethodSpec:
             changes["mask_weight"] = MASK_WEIGHT
         if suffix == "vd":
             changes["hull"] = TRAINING_DOMAIN
-            vd = config.vd if is_dataclass(config.vd) else HOOKS[self.hook or ""]()
+            vd: Any = config.vd if is_dataclass(config.vd) else HOOKS[self.hook or ""]()
             changes["vd"] = replace(vd, enabled=True)
         return replace(config, **changes | dict(self.variants.get(suffix, {})))

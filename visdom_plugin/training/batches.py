@@ -51,13 +51,14 @@ class DataManager:
 
     def view(self, index: int) -> ViewBatch:
         """A whole view by its index."""
+        counted = self._counted[index]
         return ViewBatch(
             index,
             self._cameras[index],
             self._images[index].float() / 255,
             self._masks[index].float(),
             self._depths[index] if self._depths else None,
-            None if self._counted[index] is None else self._counted[index].float(),
+            None if counted is None else counted.float(),
             self._mask_known[index],
         )
 
@@ -67,8 +68,7 @@ class DataManager:
         Raises:
             SceneError: when all pixels are ignored.
         """
-        if self._flat is None:
-            self._flatten()
+        rgb, mask = self._flat = self._flat or self._flatten()
         draw = generator(self.seed, "pixels", step)
         if self._drawable is None:
             flat = torch.randint(int(self._ends[-1]), (n,), generator=draw)
@@ -79,16 +79,14 @@ class DataManager:
         flat, view = flat.to(self.device), view.to(self.device)
         return PixelBatch(
             *rays_of_pixels(self._cameras, view, inside),
-            self._flat[0][flat].float() / 255,
-            self._flat[1][flat].float(),
+            rgb[flat].float() / 255,
+            mask[flat].float(),
             pixel_radius(self._cameras[view]),
             None if all(self._mask_known) else torch.tensor(self._mask_known, device=self.device)[view],
             flat,
         )
 
-    def _flatten(self) -> None:
-        rgb = torch.cat([image.reshape(-1, 3) for image in self._images])
-        self._flat = rgb, torch.cat([mask.reshape(-1) for mask in self._masks])
+    def _flatten(self) -> tuple[Tensor, Tensor]:
         if any(c is not None for c in self._counted):
             pairs = zip(self._counted, self._masks, strict=True)
             counted = [torch.ones_like(m, dtype=torch.bool) if c is None else c for c, m in pairs]
@@ -99,3 +97,5 @@ class DataManager:
                     cause="ignore files that are inverted: white is what must be ignored",
                     todo="invert them, or take the folder ignore away",
                 )
+        rgb = torch.cat([image.reshape(-1, 3) for image in self._images])
+        return rgb, torch.cat([mask.reshape(-1) for mask in self._masks])

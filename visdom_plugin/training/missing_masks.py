@@ -14,14 +14,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from visdom_plugin.errors import SceneError, list_some
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.scene import Scene, Views
+from visdom_plugin.hull.hull import Hull
+from visdom_plugin.scene import MaskOrigin, Scene, Views
 
 log = logging.getLogger(__name__)
 
@@ -75,10 +76,10 @@ def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> S
     for i, outline in outlines.items():
         if not bool(outline.any()):
             log.warning("%s has no mask and does not see the hull of the other views", scene.train.names[i])
-    return replace(scene, train=_filled(scene.train, outlines, way))
+    return replace(scene, train=_filled(scene.train, outlines, "colour" if way == "colour" else "hull"))
 
 
-def outline_views(hull, views: Views, indices: Sequence[int]) -> dict[int, Tensor]:
+def outline_views(hull: Hull, views: Views, indices: Sequence[int]) -> dict[int, Tensor]:
     """(H, W) bool by index: where the pixels' rays meet the hull."""
     from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 
@@ -89,7 +90,7 @@ def _missing(views: Views) -> list[int]:
     return [i for i in range(len(views)) if views.mask_origin(i) == "missing"]
 
 
-def _filled(views: Views, outlines: dict[int, Tensor], way: Way) -> Views:
+def _filled(views: Views, outlines: dict[int, Tensor], way: MaskOrigin) -> Views:
     origins = tuple(way if i in outlines else views.mask_origin(i) for i in range(len(views)))
     filled = replace(views, masks=_Replaced(views.masks, outlines), mask_origins=origins)
     if way != "colour":
@@ -102,16 +103,16 @@ def _either(one: Tensor, other: Tensor | None) -> Tensor:
     return one if other is None else one | torch.as_tensor(other)
 
 
-class _Replaced(Sequence):
+class _Replaced(Sequence[Any]):
     """A sequence with some items replaced, the others not looked at before they are asked for."""
 
-    def __init__(self, base: Sequence, changed: Mapping[int, Tensor]):
+    def __init__(self, base: Sequence[Any], changed: Mapping[int, Tensor]):
         self._base, self._changed = base, changed
 
     def __len__(self) -> int:
         return len(self._base)
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return tuple(self[i] for i in range(*index.indices(len(self))))
         index = range(len(self))[index]

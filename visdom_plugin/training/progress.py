@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
 
 
 class Progress:
@@ -19,7 +22,7 @@ class Progress:
         """
         self.total, self.start, self.quiet = total, start, quiet
         self.stream = sys.stderr if stream is None else stream
-        self._bar = None
+        self._bar: Bar | None = None
         self._shown = 0.0
 
     def __enter__(self) -> Progress:
@@ -29,7 +32,7 @@ class Progress:
             from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
             from rich.progress import Progress as Bar
 
-            self._bar = Bar(
+            self._bar = bar = Bar(
                 TextColumn("training"),
                 BarColumn(),
                 TextColumn("{task.completed}/{task.total} {task.fields[note]}"),
@@ -39,11 +42,11 @@ class Progress:
                 console=Console(file=self.stream),
                 refresh_per_second=4,
             )
-            self._bar.start()
-            self._task = self._bar.add_task("", total=self.total, completed=self.start, note="")
+            bar.start()
+            self._task = bar.add_task("", total=self.total, completed=self.start, note="")
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 

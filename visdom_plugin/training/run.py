@@ -6,6 +6,7 @@ import logging
 import platform
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -108,9 +109,22 @@ def train(
         return run.record | {"resumed_from": resumed, "already_finished": False}
 
 
-def _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds):
+def _run(
+    preset: registry.Preset,
+    config: Any,
+    scene: Scene,
+    run: RunDir,
+    data_manager: DataManager,
+    device: torch.device,
+    seed: int,
+    quiet: bool,
+    checkpoint_seconds: float,
+) -> int | None:
     saved = run.path / "hull"
-    method, hull, hull_s = build(preset, config, scene.train, device=device, seed=seed, saved=saved)
+    views = scene.train
+    if preset.hook == "gaussian" and config.hull is None:
+        views = replace(views, points=scene.points)
+    method, hull, hull_s = build(preset, config, views, device=device, seed=seed, saved=saved)
     if hull is not None:
         write_hull(hull, saved)
         # Of the run that carved it, not of one that goes on with it.
@@ -235,6 +249,7 @@ def assess(
     """
     from visdom_plugin.hull.domain import VisibleDomain
 
+    reference: Hull | None
     if hull is not None and config.hull == VisibleDomain():
         reference = hull
     elif (reference := read_hull(run_dir / "hull" / REFERENCE)) is None:

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.hooks.protocols import SamplerHook
+from visdom_plugin.hooks.protocols import SamplerHook, sample_filters
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.fields.common import (
     LocalRays,
     bound_rays,
@@ -55,7 +56,13 @@ class Ingp:
         self.total_steps = config.steps
 
     def setup(
-        self, views: Views, hooks: Sequence[SamplerHook], *, hull, device: torch.device, seed: int
+        self,
+        views: Views,
+        hooks: Sequence[SamplerHook],
+        *,
+        hull: Hull | None,
+        device: torch.device,
+        seed: int,
     ) -> None:
         c = self.config
         self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
@@ -149,7 +156,7 @@ class Ingp:
             # What rendering skips is not there.
             points = points.to(self.device)
             there = self.occupancy.is_occupied(points)
-            for hook in _filters(self._hooks_at_inference()):
+            for hook in sample_filters(self._hooks_at_inference()):
                 there &= hook.keep(self.frame.to_world(points))
             return torch.where(there, self._density(points), 0)
 
@@ -171,10 +178,10 @@ class Ingp:
         return bound_rays(origins, directions, near, torch.maximum(leave, near), self.frame, hooks, pixels)
 
     def _march(
-        self, rays: LocalRays, far: Tensor, step_length: Tensor, shift: Tensor, hooks
+        self, rays: LocalRays, far: Tensor, step_length: Tensor, shift: Tensor, hooks: Sequence[SamplerHook]
     ) -> PackedSamples:
         samples = march(rays.origins, rays.directions, rays.near, far, step_length, shift, self.occupancy)
-        for hook in _filters(hooks):
+        for hook in sample_filters(hooks):
             samples = select(samples, hook.keep(self.frame.to_world(_points(rays, samples))))
         return samples
 
@@ -197,7 +204,9 @@ class Ingp:
     def _encode_views(self, directions: Tensor) -> Tensor:
         return encode_harmonics(directions)[..., : self.config.view_degree**2]
 
-    def _shade(self, rays: LocalRays, samples: PackedSamples, background: Tensor):
+    def _shade(
+        self, rays: LocalRays, samples: PackedSamples, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         density, features = self._features(_points(rays, samples))
         # Harmonics once per ray, then spread to its samples.
         views = self._encode_views(rays.directions)[samples.ray]
@@ -211,11 +220,6 @@ class Ingp:
         wanted = int(rays * self.config.samples_per_step / max(samples, 1))
         # At most doubled: right after the first cullings rays may carry no sample at all.
         self._rays = max(LEAST_RAYS, min(wanted, 2 * rays, self.config.max_rays))
-
-
-def _filters(hooks: Sequence[SamplerHook]) -> list[SamplerHook]:
-    """The hooks that have a say about single samples, too."""
-    return [hook for hook in hooks if getattr(hook, "drop_outside", False)]
 
 
 def _points(rays: LocalRays, samples: PackedSamples) -> Tensor:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from visdom_plugin.geometry.cameras import Cameras, pixel_radius
 from visdom_plugin.hooks.protocols import SamplerHook
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.fields.common import (
     LocalRays,
     bound_rays,
@@ -118,7 +120,13 @@ class ZipNerfLite:
         self.total_steps = config.steps
 
     def setup(
-        self, views: Views, hooks: Sequence[SamplerHook], *, hull, device: torch.device, seed: int
+        self,
+        views: Views,
+        hooks: Sequence[SamplerHook],
+        *,
+        hull: Hull | None,
+        device: torch.device,
+        seed: int,
     ) -> None:
         c = self.config
         self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
@@ -160,20 +168,20 @@ class ZipNerfLite:
         if c.mask_weight:
             losses["mask"] = c.mask_weight * silhouette_loss(alpha, batch)
         if c.interlevel_weight:
-            loss = sum(
+            proposals = (
                 antialiased_interlevel_loss(
                     last.s, last.weights.detach(), level.s, level.weights, width
                 ).mean()
                 / level.weights.shape[-1]
                 for level, width in zip(levels[:-1], c.blur, strict=True)
             )
-            losses["interlevel"] = c.interlevel_weight * loss
+            losses["interlevel"] = c.interlevel_weight * reduce(torch.add, proposals)
         if c.distortion_weight:
             loss = distortion_loss(curve_distances(last.t), last.weights).mean()
             losses["distortion"] = c.distortion_weight * loss
         if c.hash_decay:
-            grids = (self.model[name].decay() for name in LEVELS)
-            losses["hash_decay"] = c.hash_decay * sum(grids)
+            grids = (self._grid(name).decay() for name in LEVELS)
+            losses["hash_decay"] = c.hash_decay * reduce(torch.add, grids)
         return StepOutput(losses, {"psnr": psnr_of(error)})
 
     def optimise(self, step: int, output: StepOutput) -> None:
@@ -218,7 +226,9 @@ class ZipNerfLite:
         far = torch.full_like(near, self.config.far)
         return bound_rays(origins, directions, near, far, self.frame, hooks, pixels)
 
-    def _see(self, rays: LocalRays, radius, counts: Sequence[int], progress: float, draw):
+    def _see(
+        self, rays: LocalRays, radius: Tensor, counts: Sequence[int], progress: float, draw: Generator
+    ) -> tuple[list[Level], Tensor]:
         """All levels along rays, and the field's colours (n, S, 3). Samples are jittered by the generator."""
         level = None
         levels = []
@@ -228,8 +238,15 @@ class ZipNerfLite:
         return levels, self._shade(out[..., 1:], rays.directions[:, None])
 
     def _look(
-        self, name: str, rays: LocalRays, radius, before: Level | None, count: int, progress: float, draw
-    ):
+        self,
+        name: str,
+        rays: LocalRays,
+        radius: Tensor,
+        before: Level | None,
+        count: int,
+        progress: float,
+        draw: Generator | None,
+    ) -> tuple[Level, Tensor]:
         """One level, sampled where the level before saw something, and its network's outputs (n, S, ...)."""
         n = len(rays.near)
         near, far = rays.near[:, None], rays.far[:, None]
@@ -246,7 +263,9 @@ class ZipNerfLite:
         density = truncated_exp(out[..., 0] + self.config.density_bias)
         return Level(s, t, weights_from_density(density, t)[0]), out
 
-    def _render_rays(self, rays: LocalRays, radius: Tensor, background: Tensor):
+    def _render_rays(
+        self, rays: LocalRays, radius: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Colour, opacity and depth of rays, level by level for those that still may show something."""
         counts = self.config.test_samples or self.config.samples
         n = len(rays.near)
@@ -261,7 +280,7 @@ class ZipNerfLite:
             seen = (level.weights.sum(-1) > INVISIBLE).nonzero()[:, 0]
             left, out, level = left[seen], out[seen], Level(*(x[seen] for x in level))
             rays = LocalRays(*(x[seen] for x in rays))
-        if len(left):
+        if level is not None and len(left):
             colours = self._shade(out[..., 1:], rays.directions[:, None])
             rgb[left], alpha[left], depth[left] = composite(level.weights, colours, level.t, background)
         return rgb, alpha, depth
@@ -270,6 +289,11 @@ class ZipNerfLite:
         view = encode_sinusoids(directions, self.config.view_degree)
         view = view.expand(*bottleneck.shape[:-1], view.shape[-1])
         return self.model["colour"](torch.cat([bottleneck, view], -1))
+
+    def _grid(self, name: str) -> AntialiasedGrid:
+        grid = self.model[name]
+        assert isinstance(grid, AntialiasedGrid)
+        return grid
 
     def _field(self, points: Tensor) -> Tensor:
         points = points.to(self.device)[:, None]

@@ -41,8 +41,8 @@ class GsGoConfig(GaussianSetConfig):
     floater_sigmas: tuple[float, float] = (1.0, 2.326)
     """Its threshold in standard deviations, from the first to the last removal."""
 
-    hull: VisibleDomain = field(default_factory=lambda: VisibleDomain(kind="released-go"))
-    """Where the Gaussians start."""
+    hull: VisibleDomain | None = field(default_factory=lambda: VisibleDomain(kind="released-go"))
+    """Where the Gaussians start; None for the points of structure from motion, where the scene has them."""
     vd: RegularizerConfig = field(default_factory=RegularizerConfig)
     """The visible-domain hook."""
 
@@ -98,8 +98,9 @@ class CorgsConfig(GaussianSetConfig):
     """The same in units of the scene; wins over the fraction. The authors: 20 for mip-NeRF 360, 10 for DTU, 5 for
     LLFF, in the units COLMAP happened to choose."""
 
-    hull: VisibleDomain = field(default_factory=lambda: VisibleDomain(kind="released-go"))
-    """Where the Gaussians start, unless that is random."""
+    hull: VisibleDomain | None = field(default_factory=lambda: VisibleDomain(kind="released-go"))
+    """Where the Gaussians start, unless that is random; None for the points of structure from motion, where the
+    scene has them."""
     vd: RegularizerConfig = field(default_factory=RegularizerConfig)
     """The visible-domain hook, called once for each set."""
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hooks.protocols import GaussianHook
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.losses import photometric_loss
 from visdom_plugin.methods.splats.common import draw_background, fit_view, load_kernels, scene_extent
 from visdom_plugin.methods.splats.configs import CorgsConfig
@@ -28,6 +29,7 @@ from visdom_plugin.methods.splats.strategy import Schedule, Strategy, every
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
+from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.model import GaussianSet
 from visdom_plugin.splat.ply import write_gaussians
 from visdom_plugin.splat.rasterise import rasterise
@@ -44,7 +46,13 @@ class CorgsLite:
         self.total_steps = config.steps
 
     def setup(
-        self, views: Views, hooks: Sequence[GaussianHook], *, hull, device: torch.device, seed: int
+        self,
+        views: Views,
+        hooks: Sequence[GaussianHook],
+        *,
+        hull: Hull | None,
+        device: torch.device,
+        seed: int,
     ) -> None:
         c = self.config
         if len(views) < 2:
@@ -75,7 +83,7 @@ class CorgsLite:
         background = draw_background(c, generator(self.seed, "step", step), self.device)
         sets = [one.gaussians() for one in self.sets]
 
-        def show(gaussians, camera: Cameras) -> Render:
+        def show(gaussians: Gaussians, camera: Cameras) -> Render:
             return rasterise(gaussians, camera, background, sh_degree=degree)
 
         renders = [show(gaussians, batch.camera) for gaussians in sets]
@@ -83,14 +91,13 @@ class CorgsLite:
         losses = _numbered(losses, 0) | _numbered(others, 1)
         if c.pseudo_every and c.pseudo_from <= done <= c.pseudo_until and done % c.pseudo_every == 0:
             camera = self.pseudo_camera(step)
-            seen = [show(gaussians, camera).rgb for gaussians in sets]
-            losses |= co_regularisation(*seen, c.ssim_weight, c.pseudo_weight)
+            first, second = (show(gaussians, camera).rgb for gaussians in sets)
+            losses |= co_regularisation(first, second, c.ssim_weight, c.pseudo_weight)
         for h, hook in enumerate(self.hooks):
             for i, gaussians in enumerate(sets):
                 # The same numbers for both sets, so that the hook shows both the same views.
                 draw = generator(self.seed, "hook", h, step)
-                found = hook.loss(lambda camera, seen=gaussians: show(seen, camera), step, draw)
-                losses |= _numbered(found, i)
+                losses |= _numbered(hook.loss(partial(show, gaussians), step, draw), i)
         return StepOutput(losses, {"psnr": psnr}, renders)
 
     def pseudo_camera(self, step: int) -> Cameras:
@@ -111,7 +118,7 @@ class CorgsLite:
             strategy.after_step(self.hooks, step)
 
     def _co_prune(self, done: int) -> None:
-        gone = unmatched(*(one.means for one in self.sets), self.co_prune_distance)
+        gone = unmatched(self.sets[0].means, self.sets[1].means, self.co_prune_distance)
         if bool(gone[0].all()):
             log.warning(
                 "step %d: the two sets are nowhere closer than %.3g, none is pruned",
@@ -165,11 +172,8 @@ def unmatched(first: Tensor, second: Tensor, distance: float) -> tuple[Tensor, T
 
     points = [x.detach().double().cpu().numpy() for x in (first, second)]
     trees = [cKDTree(p) for p in points]
-    nearest = [trees[1 - i].query(points[i], workers=-1)[0] for i in range(2)]
-    return tuple(
-        torch.from_numpy(np.asarray(d > distance)).to(x.device)
-        for d, x in zip(nearest, (first, second), strict=True)
-    )
+    far = [np.asarray(trees[1 - i].query(points[i], workers=-1)[0] > distance) for i in range(2)]
+    return torch.from_numpy(far[0]).to(first.device), torch.from_numpy(far[1]).to(second.device)
 
 
 def _numbered(losses: dict[str, Tensor], i: int) -> dict[str, Tensor]:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.protocols import GaussianHook
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.losses import disparity_loss
 from visdom_plugin.methods.splats.common import draw_background, fit_view, load_kernels, scene_extent
 from visdom_plugin.methods.splats.configs import GsGoConfig
@@ -37,7 +38,13 @@ class GsGo:
         self.total_steps = config.steps
 
     def setup(
-        self, views: Views, hooks: Sequence[GaussianHook], *, hull, device: torch.device, seed: int
+        self,
+        views: Views,
+        hooks: Sequence[GaussianHook],
+        *,
+        hull: Hull | None,
+        device: torch.device,
+        seed: int,
     ) -> None:
         c, self.origin = self.config, views.origin
         self.device, self.seed, self.hooks = device, seed, list(hooks)

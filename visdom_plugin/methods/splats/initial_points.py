@@ -1,4 +1,4 @@
-"""Where Gaussians start: a hook's points, the hull's inside, or a random box."""
+"""Where Gaussians start: a hook's points, the hull's inside, points of structure from motion, or a random box."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras, look_at_point, project
 from visdom_plugin.hooks.protocols import GaussianHook
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import Views
 
 BOX_HALF_SIDE = 0.325
@@ -16,20 +17,29 @@ BOX_HALF_SIDE = 0.325
 
 
 def draw_points(
-    hooks: Sequence[GaussianHook], hull, views: Views, n: int, draw: Generator
+    hooks: Sequence[GaussianHook], hull: Hull | None, views: Views, n: int, generator: Generator
 ) -> tuple[Tensor, Tensor]:
-    """Points of the first hook, or where there is none, points inside the hull with the views' mean colours.
+    """Points of the first hook; without one, in the hull; without a hull, those of structure from motion.
+
+    Points in the hull have the views' mean colours. Of structure from motion, `n` points are drawn.
+    Without any, points are drawn in a box around what the cameras look at.
 
     Returns:
-        xyz (N, 3) float32 world frame and rgb (N, 3) in [0, 1].
+        xyz (N, 3) float32 world frame and rgb (N, 3) in [0, 1], N at most n.
     """
     if hooks:
-        return hooks[0].initial_points(n, draw)
-    xyz = hull.sample_inside(n, draw).float()
-    return xyz, mean_masked_colour(xyz, views)
+        return hooks[0].initial_points(n, generator)
+    if hull is not None:
+        xyz = hull.sample_inside(n, generator).float()
+        return xyz, mean_masked_colour(xyz, views)
+    if views.points is not None and len(views.points[0]):
+        xyz, rgb = views.points
+        chosen = torch.randperm(len(xyz), generator=generator)[:n].sort().values
+        return xyz[chosen].float(), rgb[chosen].float()
+    return draw_box(views.cameras, n, generator)
 
 
-def draw_box(cameras: Cameras, n: int, draw: Generator) -> tuple[Tensor, Tensor]:
+def draw_box(cameras: Cameras, n: int, generator: Generator) -> tuple[Tensor, Tensor]:
     """Grey points, uniform in a cube around what the cameras look at (3DGS without a point cloud).
 
     Returns:
@@ -37,7 +47,7 @@ def draw_box(cameras: Cameras, n: int, draw: Generator) -> tuple[Tensor, Tensor]
     """
     centre = look_at_point(cameras)
     half_side = BOX_HALF_SIDE * (cameras.centres - centre).norm(dim=-1).mean()
-    unit = 2 * torch.rand(n, 3, generator=draw, dtype=torch.float64) - 1
+    unit = 2 * torch.rand(n, 3, generator=generator, dtype=torch.float64) - 1
     return (centre.double() + half_side.double() * unit).float(), torch.full((n, 3), 0.5)
 
 

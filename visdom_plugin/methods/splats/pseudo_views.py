@@ -81,13 +81,13 @@ def fit_ellipse(cameras: Cameras) -> Ellipse:
     )
 
 
-def draw_on_ellipse(ellipse: Ellipse, draw: Generator) -> Cameras:
+def draw_on_ellipse(ellipse: Ellipse, generator: Generator) -> Cameras:
     """A camera at a uniform angle."""
-    return ellipse.camera(2 * math.pi * torch.rand((), generator=draw, dtype=torch.float64))
+    return ellipse.camera(2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64))
 
 
-def draw_between(cameras: Cameras, look_at: Tensor, draw: Generator) -> Cameras:
+def draw_between(cameras: Cameras, look_at: Tensor, generator: Generator) -> Cameras:
     """A camera between a random pair of training cameras, uniform in the pair and on the way."""
-    first, second = torch.randperm(len(cameras), generator=draw)[:2].tolist()
-    t = torch.rand((), generator=draw)
+    first, second = torch.randperm(len(cameras), generator=generator)[:2].tolist()
+    t = torch.rand((), generator=generator)
     return interpolate(cameras[first], cameras[second], t, look_at)

@@ -132,13 +132,13 @@ class Strategy:
         children = split_children({k: v[split] for k, v in p.items()}, self.split_generator(done))
         splats.optimiser.append({k: torch.cat([v[clone], children[k]]) for k, v in p.items()})
         new = len(splats) - len(split)
-        p = splats.optimiser.parameters
+        p = {name: value.detach() for name, value in splats.optimiser.parameters.items()}
         gone = torch.cat([split, split.new_zeros(new)]) | (p["opacity_logits"].sigmoid() < c.prune_opacity)
         start = self.schedule.prune_large_from
         if start is not None and done > start:
             radius, scale = self.schedule.largest
             on_screen = torch.cat([self._radius_px, self._radius_px.new_zeros(new)])
-            in_space = p["log_scales"].detach().exp().amax(-1)
+            in_space = p["log_scales"].exp().amax(-1)
             gone |= (on_screen > radius) | (in_space > scale * splats.extent)
         if not bool(gone.all()):
             splats.optimiser.keep(~gone)

@@ -38,6 +38,8 @@ def from_plain(template: T, plain: Any, where: str, path: str = "") -> T:
     label = path or "the top level"
     if not isinstance(plain, dict):
         raise ConfigError(f"{label} must be a mapping, not {plain!r}", where=where)
+    if not is_dataclass(template) or isinstance(template, type):
+        raise TypeError(f"{label}: the template is no dataclass")
     valid = [f.name for f in fields(template) if f.init]
     hints = get_type_hints(type(template))
     changes = {}
@@ -127,6 +129,6 @@ def _coerce(value: Any, hint: Any) -> tuple[bool, Any]:
 def _spell(hint: Any) -> str:
     if get_origin(hint) is Literal:
         return "one of " + ", ".join(repr(a) for a in get_args(hint))
-    if dict in map(get_origin, (hint, *get_args(hint))):
+    if any(get_origin(part) is dict for part in (hint, *get_args(hint))):
         return "a mapping"
     return "a value of type " + (hint.__name__ if isinstance(hint, type) else str(hint))

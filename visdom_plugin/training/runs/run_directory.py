@@ -15,7 +15,7 @@ import os
 import shutil
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -44,7 +44,7 @@ def hash_views(views: Views) -> str:
     """
     digest = hashlib.sha256()
 
-    def add(*arrays) -> None:
+    def add(*arrays: Any) -> None:
         for array in arrays:
             array = np.ascontiguousarray(array)
             digest.update(f"{array.dtype}{array.shape}".encode())
@@ -101,7 +101,7 @@ class RunDir:
     def __init__(self, path: Path):
         self.path = Path(path)
         self.record: dict[str, Any] = {}
-        self._lock = None
+        self._lock: TextIO | None = None
         self._is_new = False
 
     @classmethod
@@ -186,7 +186,7 @@ class RunDir:
     def __enter__(self) -> RunDir:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def log(self, row: dict[str, Any]) -> None:
