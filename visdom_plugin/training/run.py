@@ -196,7 +196,7 @@ def build(
         hull = config.hull.carve(*views.silhouettes()) if hull is None else hull
     hull_s = time.monotonic() - began
     near = move_near(views)
-    near_hull = hull if hull is None or near is views else hull.relative_to(near.origin)
+    near_hull = hull if hull is None or near is views else hull.relative_to(near.origin.numpy())
     method: Method = preset.load()(config)
     method.setup(near, make_hooks(config, near_hull, near), hull=near_hull, device=device, seed=seed)
     if near is not views:
