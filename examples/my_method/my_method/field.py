@@ -12,7 +12,12 @@ class Field:
         self.config, self.total_steps, self.radius = config, config.steps, config.radius
 
     def setup(self, views, hooks, *, hull, device, seed):
-        self.hooks, self.device, self.frame = hooks, device, frame_of(views.cameras)
+        self.hooks, self.device, self.origin, self.frame = (
+            hooks,
+            device,
+            views.origin,
+            frame_of(views.cameras),
+        )
         self.grid = torch.nn.Parameter(torch.zeros(1, 4, *3 * [self.config.resolution], device=device))
         self.optimiser = FieldOptimiser([({"grid": self.grid}, 0.0)], betas=(0.9, 0.99), eps=1e-15)
 
@@ -55,4 +60,4 @@ class Field:
     def export(self, folder):
         density, colour = lambda x: self.look(x)[0], lambda x, _: self.look(x)[1]
         mesh = common.mesh_density(density, colour, self.frame, self.radius)
-        return common.export_mesh(folder / "mesh.ply", mesh)
+        return common.export_mesh(folder / "mesh.ply", mesh, self.origin)
