@@ -12,12 +12,7 @@ class Field:
         self.config, self.total_steps, self.radius = config, config.steps, config.radius
 
     def setup(self, views, hooks, *, hull, device, seed):
-        self.hooks, self.device, self.origin, self.frame = (
-            hooks,
-            device,
-            views.origin,
-            frame_of(views.cameras),
-        )
+        self.hooks, self.origin, self.frame = hooks, views.origin, frame_of(views.cameras)
         self.grid = torch.nn.Parameter(torch.zeros(1, 4, *3 * [self.config.resolution], device=device))
         self.optimiser = FieldOptimiser([({"grid": self.grid}, 0.0)], betas=(0.9, 0.99), eps=1e-15)
 
@@ -25,7 +20,7 @@ class Field:
         return self.config.rays
 
     def look(self, points):
-        at = (points.to(self.device) / self.radius).flip(-1).reshape(1, -1, 1, 1, 3)
+        at = (points.to(self.grid.device) / self.radius).flip(-1).reshape(1, -1, 1, 1, 3)
         values = torch.nn.functional.grid_sample(self.grid, at, padding_mode="border", align_corners=True)
         return torch.exp(20 * values[0, 0, :, 0, 0] - 1), (10 * values[0, 1:, :, 0, 0]).T.sigmoid()
 
@@ -39,7 +34,7 @@ class Field:
         return composite(weights, rgb.reshape(len(t), -1, 3), t, background)
 
     def train_step(self, batch, step):
-        white = torch.ones(3, device=self.device)
+        white = torch.ones(3, device=self.grid.device)
         rgb, alpha, _ = self.trace(batch.origins, batch.directions, white, self.hooks, training=True)
         losses = {"colour": (rgb - common.photograph_on(white, batch, alpha)).square().mean()}
         return StepOutput(losses | {"mask": self.config.mask_weight * common.silhouette_loss(alpha, batch)})
