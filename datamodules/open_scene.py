@@ -17,16 +17,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from datamodules.capture import Capture, LoadedView, ViewFiles
+from datamodules.capture import Capture, Frame, LoadedView, Pools, ViewFiles
 from datamodules.files.colmap_points import read_points
 from datamodules.files.paths import check_name, inside, printable, stem
 from datamodules.hashing import hash_parts
 from datamodules.request import Request
 from datamodules.views import splits
+from datamodules.views.find_files import ImageFiles
 from datamodules.views.lazy import LaterViews
 from datamodules.views.mask_files import assign_masks, find_ignored, looks_inverted
 from datamodules.views.reader import ViewReader, spread_out
-from visdom_plugin.errors import SceneError
+from visdom_plugin.errors import SceneError, list_some
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.scene import Scene, Views
 
@@ -43,6 +44,8 @@ class Chosen(NamedTuple):
     """How much smaller the photographs' files are than the cameras say."""
     files: list[ViewFiles]
     """Of the training views, then of the test views."""
+    notes: list[str]
+    """How files were found, where that is not plain."""
 
 
 def choose_files(capture: Capture, request: Request) -> Chosen:
@@ -58,13 +61,21 @@ def choose_files(capture: Capture, request: Request) -> Chosen:
         )
     _check_names(capture, request)
     names = [frame.name for frame in capture.frames]
-    split = splits.choose(capture.root, names, request, capture.pools, indexed=capture.indexed)
-    wanted = [*split.train, *split.test]
     folder, factor = _photographs(capture, request.downscale / capture.shrunk, request)
+    there = ImageFiles(capture.root)
+    asked = [_name_in(folder, capture, frame.image) for frame in capture.frames]
+    found = [there.find(name) for name in asked]
+    notes = _note_found(capture, asked, found)
+    pools = _without(capture.pools, [i for i, image in enumerate(found) if image is None], len(found))
+    split = splits.choose(capture.root, names, request, pools, indexed=capture.indexed)
+    wanted = [*split.train, *split.test]
+    _refuse_absent(capture.root, [asked[i] for i in wanted if found[i] is None])
     masks = assign_masks(capture, wanted, request)
     ignored = find_ignored(capture, wanted, request)
-    files = [_files(capture, i, folder, masks[i], ignored.get(i)) for i in wanted]
-    return Chosen(split, folder, factor, files)
+    files = [
+        _files(capture.frames[i], found[i] or asked[i], masks.of[i], ignored.get(i), there) for i in wanted
+    ]
+    return Chosen(split, folder, factor, files, [*notes, *masks.notes])
 
 
 def open_capture(capture: Capture, request: Request) -> Scene:
@@ -79,7 +90,7 @@ def open_capture(capture: Capture, request: Request) -> Scene:
         SceneError: for every fault of the data.
         ConfigError: for a list given by hand that does not fit the data.
     """
-    split, folder, factor, files = choose_files(capture, request)
+    split, folder, factor, files, found = choose_files(capture, request)
     names = [frame.name for frame in capture.frames]
     calibration = capture.calibrate([*split.train, *split.test])
     reader = ViewReader(files, calibration, factor, request.downscale / capture.shrunk, capture, request)
@@ -108,6 +119,7 @@ def open_capture(capture: Capture, request: Request) -> Scene:
     notes = (
         f"layout {capture.layout}: {split.rule}",
         *capture.notes,
+        *found,
         *_note_soft(loaded),
         *_note_remarks(loaded),
     )
@@ -147,6 +159,9 @@ def _photographs(capture: Capture, downscale: float, request: Request) -> tuple[
     if inside(root, base, outside=outside).is_dir():
         return base, 1.0
     others = sorted(p.name for p in root.glob(f"{PurePosixPath(base).name}_*") if p.is_dir())
+    others = [name for name in others if name.rpartition("_")[2].replace(".", "", 1).isdecimal()]
+    if not others and any(ImageFiles(root).find(frame.image) for frame in capture.frames[:1]):
+        return base, 1.0
     raise SceneError(
         f"the folder {base} is missing"
         + (f"; there is {', '.join(map(printable, others))}" if others else ""),
@@ -157,16 +172,57 @@ def _photographs(capture: Capture, downscale: float, request: Request) -> tuple[
     )
 
 
-def _files(
-    capture: Capture, index: int, folder: str | None, mask: str | None, ignored: str | None
-) -> ViewFiles:
-    frame = capture.frames[index]
-    image = frame.image
-    if folder is not None and folder != capture.photographs:
-        below = image.removeprefix(f"{capture.photographs}/")
-        image = f"{folder}/{below}" if below != image else image
-    excluded = frame.excluded or ignored
-    return ViewFiles(frame.name, image, mask, frame.ignore, excluded, frame.depth)
+def _name_in(folder: str | None, capture: Capture, image: str) -> str:
+    """A photograph's name, in the folder of smaller copies where these are read."""
+    below = image.removeprefix(f"{capture.photographs}/")
+    return image if folder in (None, capture.photographs) or below == image else f"{folder}/{below}"
+
+
+def _note_found(capture: Capture, asked: Sequence[str], found: Sequence[str | None]) -> list[str]:
+    """What is to be said of photographs under other names and of those that are not there."""
+    notes = []
+    other = [(a, f) for a, f in zip(asked, found, strict=True) if f is not None and f != a]
+    if other:
+        notes.append(
+            f"{len(other)} of {len(asked)} photographs lie under another name than the poses give: "
+            f"{printable(other[0][1])} for {printable(other[0][0])}"
+        )
+    absent = sorted(i for i in {*capture.pools.train, *capture.pools.test} if found[i] is None)
+    if absent and len(absent) < len(asked):
+        names = list_some([printable(capture.frames[i].name) for i in absent])
+        notes.append(f"{len(absent)} of {len(asked)} frames have no photograph and are left out: {names}")
+    for note in notes:
+        log.warning("%s: %s", capture.root, note)
+    return notes
+
+
+def _without(pools: Pools, absent: Sequence[int], count: int) -> Pools:
+    """The layout's split of the views that have a photograph; of all where none has, so that this is told."""
+    if not absent or len(absent) == count:
+        return pools
+    if pools == splits.every_eighth(range(count)):
+        return splits.every_eighth([i for i in range(count) if i not in absent])
+    train, test = (tuple(i for i in part if i not in absent) for part in (pools.train, pools.test))
+    return Pools(train, test, pools.rule)
+
+
+def _refuse_absent(root: Path, absent: Sequence[str]) -> None:
+    if absent:
+        raise SceneError(
+            f"{len(absent)} of the photographs that are asked for are missing: "
+            f"{list_some([printable(name) for name in absent])}",
+            where=root / absent[0],
+            cause="the scene was copied only in part, or the photographs were renamed",
+            todo="copy them there, or list only views that have one, with --train-list and --test-list",
+        )
+
+
+def _files(frame: Frame, image: str, mask: str | None, ignored: str | None, there: ImageFiles) -> ViewFiles:
+    def found(name: str | None) -> str | None:
+        return name and (there.find(name, anywhere=False) or name)
+
+    ignore, excluded = found(frame.ignore), found(frame.excluded or ignored)
+    return ViewFiles(frame.name, image, found(mask), ignore, excluded, found(frame.depth))
 
 
 def _views(cameras: Cameras, loaded: Sequence[LoadedView], names: Sequence[str]) -> Views:

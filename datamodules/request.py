@@ -31,6 +31,8 @@ class Request:
     mask_source: Literal["auto", "folder", "alpha"] = "auto"
     """Where foreground masks are: files, the photographs' alpha channels, or whichever there is; where both
     are, they must agree."""
+    masks: str | None = None
+    """Folder of the foreground masks, below the scene's; None takes the layout's, or one that is called alike."""
     mask_path: Literal["ignore", "foreground"] = "ignore"
     """What the files named by `mask_path` in a transforms.json mean: black pixels are to be ignored, which is
     nerfstudio's meaning, or white pixels are the object."""

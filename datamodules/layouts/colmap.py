@@ -96,7 +96,7 @@ def read_capture(
         layout,
         frames,
         calibrate,
-        splits.every_eighth(len(frames)),
+        splits.every_eighth(range(len(frames))),
         (*model.files, points) if points else model.files,
         indexed=indexed,
         photographs="images",

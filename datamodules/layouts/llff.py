@@ -100,7 +100,7 @@ def read_capture(
         layout,
         frames,
         calibrate,
-        splits.every_eighth(len(frames)),
+        splits.every_eighth(range(len(frames))),
         (file,),
         photographs="images",
         mask_folder=mask_folder,

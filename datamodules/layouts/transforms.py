@@ -269,7 +269,7 @@ def _pools(frames: Sequence[Frame], of_name: dict, files: Sequence[Transforms]) 
         test = tuple(i for i, frame in enumerate(frames) if of_name[frame.name][1].file_path in listed)
         rule = "test_filenames"
     else:
-        return splits.every_eighth(len(frames))
+        return splits.every_eighth(range(len(frames)))
     held = set(test)
     train = [i for i in range(len(frames)) if i not in held]
     if len(files) == 1 and files[0].train is not None:

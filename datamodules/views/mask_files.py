@@ -3,63 +3,75 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from datamodules.capture import Capture
+from datamodules.files.images import ENDINGS
 from datamodules.files.paths import inside, printable, stem
 from datamodules.request import Request
+from datamodules.views.find_files import loose_key
 from visdom_plugin.errors import SceneError, list_some
 
 log = logging.getLogger(__name__)
 
-ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+_OTHER_FOLDERS = (
+    "mask", "matting", "mattings", "matte", "mattes", "alpha", "alphas", "silhouette", "silhouettes",
+    "segmentation", "segmentations", "foreground", "object_mask", "object_masks", "image_mask", "images_mask",
+    "image_masks", "images_masks", "mask_images", "masks_png",
+)  # fmt: skip
+"""Names under which folders of masks are known elsewhere."""
 
 
-def mask_names(photograph: str) -> tuple[str, ...]:
-    """The names under which the mask of a photograph may lie in the mask folder, the usual one first."""
-    starts = stem(photograph), photograph, f"{stem(photograph)}_mask"
-    return tuple(start + end for start in starts for end in ENDINGS)
+class MaskFiles(NamedTuple):
+    """The mask file of each wanted frame, below the root, and how they were found where that is not plain."""
+
+    of: dict[int, str | None]
+    """By the frame's position; None where the alpha channel must do."""
+    notes: tuple[str, ...] = ()
 
 
-def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> dict[int, str | None]:
-    """The mask file of each wanted frame, below the root; None where the alpha channel must do.
+def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> MaskFiles:
+    """The mask file of each wanted frame.
 
     Raises:
         SceneError: wanted frames without a mask, or masks that look shifted against the photographs.
     """
     named = {i: capture.frames[i].mask for i in wanted}
     open_ones = [i for i in wanted if named[i] is None]
-    folder = capture.mask_folder
-    if not open_ones or folder is None:
-        return named
-    path = inside(capture.root, folder, outside=request.allow_outside)
-    if request.mask_source == "alpha" or not path.is_dir():
-        return named
-    there = {file.relative_to(path).as_posix() for file in path.rglob("*") if file.suffix in ENDINGS}
+    if not open_ones or request.mask_source == "alpha":
+        return MaskFiles(named)
     photographs = _photographs(capture)
-    used: set[str] = set()
+    folder, notes = _find_folder(capture, photographs, open_ones, request)
+    if folder is None:
+        return MaskFiles(named)
+    path = inside(capture.root, folder, outside=request.allow_outside)
+    there = _image_files(path)
+    matched, affix = _match(photographs, there)
+    if any(affix):
+        notes.append(
+            f"masks are named like their photographs, with {affix[0]!r} before and {affix[1]!r} after"
+        )
     found: dict[int, str] = {}
-    for i, names in enumerate(photographs):
-        # The photograph's folders may be repeated among the masks, or left out where that is unambiguous.
-        files = next(filter(None, ([m for m in mask_names(n) if m in there] for n in names)), [])
-        used.update(files)
+    for i, files in matched.items():
         if len(files) > 1 and i in named:
             raise SceneError(
-                f"{printable(names[0])} has more than one mask: {', '.join(map(printable, files))}",
+                f"{printable(photographs[i][0])} has more than one mask: {', '.join(map(printable, files))}",
                 where=path,
                 todo="keep the right one",
             )
-        if files:
-            found[i] = f"{folder}/{files[0]}"
+        found[i] = f"{folder}/{files[0]}"
     missing = [i for i in open_ones if i not in found]
+    used = {file for files in matched.values() for file in files}
     extra = sorted(printable(stem(name)) for name in there - used)
-    shift = _find_shift((name for names in photographs for name in names), there)
+    shift = 0 if any(affix) else _find_shift((name for names in photographs for name in names), there)
     if (missing or shift) and not request.allow_missing_masks:
         missing = missing or [i for i in range(len(photographs)) if i not in found]
         hint = f"there are masks that no image has: {list_some(extra)}" if extra else None
@@ -81,22 +93,98 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> d
             len(extra),
             list_some(extra),
         )
-    return {i: named[i] or found.get(i) for i in wanted}
+    for note in notes:
+        log.info("%s: %s", path, note)
+    return MaskFiles({i: named[i] or found.get(i) for i in wanted}, tuple(notes))
 
 
 def find_ignored(capture: Capture, wanted: Sequence[int], request: Request) -> dict[int, str]:
     """The files in the folder `ignore`, white where a frame's photograph tells nothing, below the root."""
-    found: dict[int, str] = {}
-    if not (capture.root / "ignore").is_dir():
-        return found
-    photographs = _photographs(capture)
-    for i in wanted:
-        files = (f"ignore/{file}" for name in photographs[i] for file in mask_names(name))
-        for file in files:
-            if inside(capture.root, file, outside=request.allow_outside).is_file():
-                found[i] = file
-                break
-    return found
+    path = inside(capture.root, "ignore", outside=request.allow_outside)
+    if not path.is_dir():
+        return {}
+    matched, _ = _match(_photographs(capture), _image_files(path))
+    return {i: f"ignore/{matched[i][0]}" for i in wanted if i in matched}
+
+
+def _find_folder(
+    capture: Capture, photographs: Sequence[tuple[str, ...]], wanted: Sequence[int], request: Request
+) -> tuple[str | None, list[str]]:
+    """The folder of masks and a note on it: the one that the request names, the layout's, or the only other one
+    that is called like a folder of masks and holds one for each wanted photograph."""
+    folder = request.masks or capture.mask_folder
+    if folder is None:
+        return None, []
+    if request.masks and Path(folder).is_absolute():
+        folder = os.path.relpath(folder, capture.root)
+    if inside(capture.root, folder, outside=request.allow_outside).is_dir():
+        return folder, []
+    if request.masks:
+        raise SceneError(
+            f"there is no folder {printable(folder)} for the masks",
+            where=capture.root,
+            todo="name one below the scene's folder with --masks",
+        )
+    others = []
+    for path in sorted(capture.root.iterdir()):
+        if path.name.lower() in _OTHER_FOLDERS and path.is_dir():
+            matched, _ = _match(photographs, _image_files(path))
+            if all(len(matched.get(i, ())) == 1 for i in wanted):
+                others.append(path.name)
+    if len(others) == 1:
+        return others[0], [f"masks are read from the folder {others[0]}, for want of {folder}"]
+    if others:
+        raise SceneError(
+            f"the folder {folder} is missing, and {' and '.join(others)} could stand in for it",
+            where=capture.root,
+            todo=f"say which holds masks that are white on the object: --masks {others[0]}",
+        )
+    return None, []
+
+
+def _image_files(path: Path) -> set[str]:
+    return {file.relative_to(path).as_posix() for file in path.rglob("*") if file.suffix.lower() in ENDINGS}
+
+
+def _match(
+    photographs: Sequence[tuple[str, ...]], files: set[str]
+) -> tuple[dict[int, list[str]], tuple[str, str]]:
+    """Files by the photograph's position, and what all their names have before and after the photograph's.
+
+    A file is named like its photograph, with or without the latter's ending, or with _mask behind; ending, case
+    and Unicode form may differ where that is unambiguous. The photograph's folders may be repeated, or left out.
+    """
+    exact, loose = defaultdict(list), defaultdict(list)
+    for file in sorted(files, key=lambda name: (ENDINGS.index(PurePosixPath(name).suffix.lower()), name)):
+        exact[stem(file)].append(file)
+        loose[loose_key(file)].append(file)
+
+    def look_up(names: tuple[str, ...], before: str = "", after: str = "") -> list[str]:
+        for table, key in ((exact, str), (loose, _fold)):
+            for name in names:
+                path = PurePosixPath(stem(name))
+                starts = [str(path), name, f"{path}_mask"]
+                if before or after:
+                    starts = [str(path.with_name(f"{before}{path.name}{after}"))]
+                if hits := [file for start in starts for file in table.get(key(start), ())]:
+                    return list(dict.fromkeys(hits))
+        return []
+
+    found = {i: hits for i, names in enumerate(photographs) if (hits := look_up(names))}
+    if files and photographs and not found:
+        # Tools add the same to every name: cup-removebg-preview, mask_cup, cup.mask.
+        name = PurePosixPath(stem(photographs[0][0])).name
+        for file in sorted(files):
+            before, here, after = PurePosixPath(stem(file)).name.partition(name)
+            if here and not before[-1:].isalnum() and not after[:1].isalnum():
+                every = {i: look_up(names, before, after) for i, names in enumerate(photographs)}
+                if all(len(files_of) == 1 for files_of in every.values()):
+                    return every, (before, after)
+    return found, ("", "")
+
+
+def _fold(start: str) -> str:
+    return loose_key(f"{start}.png")
 
 
 def looks_inverted(mask: Tensor) -> bool:

@@ -36,10 +36,10 @@ class Split:
     """How the views were chosen, for people."""
 
 
-def every_eighth(count: int) -> Pools:
-    """The standard split of MipNeRF360: positions 0, 8, 16, ... test, the others train."""
-    test = tuple(range(0, count, 8)) if count > 1 else ()
-    return Pools(tuple(i for i in range(count) if i not in test), test, "every 8th view is for testing")
+def every_eighth(positions: Sequence[int]) -> Pools:
+    """The standard split of MipNeRF360: of some positions every 8th from the first on is for testing."""
+    test = tuple(positions[::8]) if len(positions) > 1 else ()
+    return Pools(tuple(i for i in positions if i not in test), test, "every 8th view is for testing")
 
 
 def spread(pool: Sequence[int], count: int) -> list[int]:

@@ -265,11 +265,11 @@ def test_mean_and_worst():
 @pytest.mark.parametrize("count", [3, 4, 9])
 def test_all_photographs_can_train_where_nothing_but_the_layout_sets_some_aside(tmp_path, count):
     names = [f"{i}.jpg" for i in range(count)]
-    found = choose(tmp_path, names, Request(views=count, hold_out=False), every_eighth(count))
+    found = choose(tmp_path, names, Request(views=count, hold_out=False), every_eighth(range(count)))
     assert found.train == list(range(count)) and found.test == []
     with pytest.raises(SceneError):
-        choose(tmp_path, names, Request(views=count), every_eighth(count))
+        choose(tmp_path, names, Request(views=count), every_eighth(range(count)))
     # What an index file sets aside stays there.
     (tmp_path / "sparse_test.txt").write_text("1\n")
-    found = choose(tmp_path, names, Request(views=2, hold_out=False), every_eighth(count))
+    found = choose(tmp_path, names, Request(views=2, hold_out=False), every_eighth(range(count)))
     assert found.test == [1] and 1 not in found.train and 0 in found.train

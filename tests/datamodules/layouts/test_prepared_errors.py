@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 import struct
 import tracemalloc
 import zlib
@@ -79,12 +80,12 @@ def _shift_masks(folder):
 # name: (what is done to the folder, words that the message must hold)
 FAULTS = {
     "no model": (lambda f: (f / "sparse/0/images.txt").unlink(), ["no COLMAP model", "images.bin"]),
-    "no images folder": (lambda f: (f / "images").rename(f / "photos"), ["folder images is missing"]),
+    "no images folder": (lambda f: shutil.rmtree(f / "images"), ["folder images is missing"]),
     "images folder only at half size": (
         lambda f: (f / "images").rename(f / "images_2"),
         ["folder images is missing", "--downscale 2"],
     ),
-    "no masks folder": (lambda f: (f / "masks").rename(f / "mask"), ["folder masks is missing"]),
+    "no masks folder": (lambda f: shutil.rmtree(f / "masks"), ["folder masks is missing"]),
     "no training list": (lambda f: (f / "sparse_4.txt").unlink(), ["no sparse_<N>.txt"]),
     "no test list": (lambda f: (f / "sparse_test.txt").unlink(), ["sparse_test.txt is missing"]),
     "missing mask": (lambda f: (f / "masks/train_002.png").unlink(), ["train_002", "no mask"]),

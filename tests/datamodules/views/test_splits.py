@@ -24,7 +24,7 @@ def test_training_views_are_the_same_whether_test_views_are_asked_for_or_not(
     listed = ",".join(names[i] for i in held) if how == "hand" else None
     if how == "file":
         (root / "sparse_test.txt").write_text("\n".join(map(str, held)))
-    pools = every_eighth(count)
+    pools = every_eighth(range(count))
     free = set(pools.train) - (set(held) if how != "rule" else set())
     if not free:
         return
@@ -39,7 +39,7 @@ def test_training_views_are_the_same_whether_test_views_are_asked_for_or_not(
 
 @pytest.mark.parametrize("count", [2, 4, 9])
 def test_who_needs_no_test_view_gets_all_views_but_those_listed_for_testing(count, tmp_path):
-    names, pools = _names(count), every_eighth(count)
+    names, pools = _names(count), every_eighth(range(count))
     found = choose(tmp_path, names, Request(views=count, test=False), pools)
     assert found.train == list(range(count)) and "no view is held out" in found.rule
     with pytest.raises(SceneError, match=f"{count + 1} training views are wanted"):
@@ -51,7 +51,7 @@ def test_who_needs_no_test_view_gets_all_views_but_those_listed_for_testing(coun
 
 
 def test_the_advice_to_list_all_views_works(tmp_path):
-    names, pools = _names(4), every_eighth(4)
+    names, pools = _names(4), every_eighth(range(4))
     with pytest.raises(SceneError, match="3 of the 4 views are for training") as caught:
         choose(tmp_path, names, Request(views=4), pools)
     listed = re.search(r"--train-list (\S+)", caught.value.todo).group(1)

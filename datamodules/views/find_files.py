@@ -1,0 +1,84 @@
+"""Names in pose files against names on disk: another ending, case, folder or Unicode form."""
+
+from __future__ import annotations
+
+import os
+import unicodedata
+from collections import defaultdict
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+
+from datamodules.files.images import ENDINGS
+
+_MOST_FILES = 200_000
+_NO_PHOTOGRAPHS = (
+    "mask",
+    "matt",
+    "ignore",
+    "depth",
+    "normal",
+    "segment",
+    "silhouette",
+    "alpha",
+    "ground_truth",
+)
+
+
+def loose_key(name: str) -> str:
+    """What names have in common that differ in case, in Unicode form and in an image's ending."""
+    start, dot, ending = name.rpartition(".")
+    name = start if dot and f".{ending.lower()}" in ENDINGS else name
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+class ImageFiles:
+    """The image files below a folder, which is walked when the first name is not there as it is written."""
+
+    def __init__(self, root: Path):
+        self._root = root
+
+    @cached_property
+    def _by_key(self) -> dict[str, list[str]]:
+        found, count = defaultdict(list), 0
+        for folder, folders, files in os.walk(self._root):
+            folders[:] = sorted(name for name in folders if not name.startswith("."))
+            count += len(files)
+            if count > _MOST_FILES:
+                break
+            for file in files:
+                if file.lower().endswith(ENDINGS):
+                    found[loose_key(file)].append(Path(folder, file).relative_to(self._root).as_posix())
+        return found
+
+    def find(self, name: str, *, anywhere: bool = True) -> str | None:
+        """The one file that a name can mean, or the name itself where there is such a file; else None.
+
+        The ending, the case, the Unicode form and leading folders may differ. Of several candidates, the one that
+        shares most of the last folders counts; folders of masks, depths and smaller copies hold no photographs
+        unless the name says so.
+
+        Args:
+            anywhere: False looks in the folder alone that the name gives.
+        """
+        if (self._root / name).exists():
+            return name
+        wanted = _folders(name)
+        shared = defaultdict(list)
+        for file in self._by_key.get(loose_key(PurePosixPath(name).name), ()):
+            folders = _folders(file)
+            strange = [f for f in folders if any(word in f for word in _NO_PHOTOGRAPHS) or _is_smaller(f)]
+            if folders == wanted or (anywhere and all(folder in wanted for folder in strange)):
+                common = 0
+                while common < min(len(folders), len(wanted)) and folders[-1 - common] == wanted[-1 - common]:
+                    common += 1
+                shared[common].append(file)
+        best = shared[max(shared)] if shared else []
+        return best[0] if len(best) == 1 else None
+
+
+def _folders(name: str) -> list[str]:
+    return [loose_key(part) for part in PurePosixPath(name).parts[:-1]]
+
+
+def _is_smaller(folder: str) -> bool:
+    return folder.startswith("images_") and folder.removeprefix("images_").isdecimal()
