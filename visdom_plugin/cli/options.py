@@ -27,7 +27,7 @@ Device = Literal["auto", "cpu", "cuda"]
 Budget = Literal["quick", "full"]
 READING = (
     "views", "downscale", "seed", "missing_masks", "mask_source", "data_format", "train_list", "test_list",
-    "frame", "mask_path", "allow_outside",
+    "frame", "masks", "mask_path", "allow_outside",
 )  # fmt: skip
 """Common options that say how a scene is read, kept in run.json to read it again."""
 
@@ -44,6 +44,8 @@ class Reading:
     """Test views by hand, in the same way."""
     frame: int | None = None
     """Which frame of a video layout (ActorsHQ); by default the first there is."""
+    masks: str | None = None
+    """Folder of the foreground masks, below the scene's; by default masks, or one that is called alike."""
     mask_path: Literal["ignore", "foreground"] = "ignore"
     """What mask_path in a transforms.json names: black is to be ignored (nerfstudio), or white is the object."""
     allow_outside: bool = False
