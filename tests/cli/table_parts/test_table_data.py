@@ -131,6 +131,7 @@ def test_what_a_reading_may_hold_reaches_the_run():
         "train_list": "0,1",
         "test_list": "2",
         "frame": 3,
+        "masks": "outlines",
         "mask_path": "foreground",
         "allow_outside": True,
     }
