@@ -273,7 +273,8 @@ def _decisive(record: dict[str, Any]) -> dict[str, Any]:
     """What must agree in two records of one run."""
     data = record.get("data")
     if isinstance(data, dict):
-        data = {name: value for name, value in data.items() if name not in _WHEREABOUTS}
+        # An option that nobody gave may be new since the record was written.
+        data = {name: v for name, v in data.items() if name not in _WHEREABOUTS and v is not None}
     return {name: record.get(name) for name in IDENTITY if name != "scene"} | {"data": data}
 
 
