@@ -306,9 +306,7 @@ def _grid_case(layout, count: int):
 STEP_PIECES = (
     "dense",
     "sample",
-    "dilate",
     "antialiased",
-    "sharp",
     "distortion",
     "hexagons",
     "random hexagons",

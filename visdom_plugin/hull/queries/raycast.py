@@ -12,6 +12,7 @@ step fills, and no wrongly guessed branch throws work away.
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
@@ -249,7 +250,7 @@ def _cast(
 def cast(hull: Hull, origins: Tensor | np.ndarray, directions: Tensor | np.ndarray) -> Crossing:
     """First entry into and last exit from the occupied voxels, exact to rounding.
 
-    On the CPU numba walks the voxels, on CUDA `cast_with_torch` does it in torch.
+    On the CPU numba walks the voxels; on CUDA `cast_with_torch` does it, by a Triton kernel where there is Triton.
 
     Args:
         origins, directions: (..., 3) tensors or arrays, broadcast against each other; world frame; directions of
@@ -298,7 +299,8 @@ def cast_with_torch(hull: Hull, origins: Tensor, directions: Tensor) -> Crossing
     lower, edges = (torch.as_tensor(x, device=device) for x in (hull.bounds[0].copy(), hull.voxel_edges))
     o = ((origins.detach().double() - lower) / edges).expand(*shape, 3).reshape(-1, 3)
     d = (directions.detach().double() / edges).expand(*shape, 3).reshape(-1, 3)
-    low, high = torch.as_tensor(occupied_box(hull.occupancy), device=device)
+    box = hull._once("box", lambda: occupied_box(hull.occupancy).astype(float))
+    low, high = torch.as_tensor(box, device=device)
     planes = torch.stack([(low - o) / d, (high - o) / d])
     within = (o >= low) & (o < high)
     planes = torch.where(d == 0, torch.where(within, torch.inf, torch.nan), planes)
@@ -319,7 +321,18 @@ def _march_ahead(hull: Hull, o: Tensor, d: Tensor, begin: Tensor, end: Tensor, a
     device = o.device
     distance = hull._once(("distance", str(device)), lambda: torch.from_numpy(bricks.ahead.min(0)).to(device))
     grid = hull._grid_on(device)
-    size = torch.tensor(hull.shape, device=device)
+    if device.type == "cuda" and find_spec("triton"):
+        from visdom_plugin.hull.queries.march_triton import march
+
+        return march(o, d, begin, end, alive, grid, distance)
+    return march_with_torch(o, d, begin, end, alive, grid, distance)
+
+
+def march_with_torch(
+    o: Tensor, d: Tensor, begin: Tensor, end: Tensor, alive: Tensor, grid: Tensor, distance: Tensor
+) -> Tensor:
+    """Twin of `march_triton.march`, which describes the arguments: one step of all rays at a time."""
+    size = torch.tensor(grid.shape, device=o.device)
     found = torch.full_like(begin, -1.0)
     rays = alive.nonzero()[:, 0]
     o, d, t, end = o[rays], d[rays], begin[rays], end[rays]
