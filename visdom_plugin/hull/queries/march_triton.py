@@ -1,7 +1,7 @@
 """The march of rays through a hull's bricks on CUDA as one Triton kernel. Imported only where it is used.
 
-Its twin is the loop in torch, `raycast.march_with_torch`: the same steps in the same arithmetic, but a program walks
-its own rays to their end, so that a call is one launch and the host waits for nothing.
+Its twin is the loop in torch, `raycast.march_with_torch`: the same steps in the same arithmetic, but a
+program walks its rays to their end, so that a call is one launch and the host waits for nothing.
 """
 
 from __future__ import annotations
