@@ -80,6 +80,6 @@ class GaussianSet:
 
     def reset_opacity(self) -> None:
         """Lowers all opacities to at most 0.01."""
-        ceiling = torch.tensor(RESET_OPACITY).logit()
+        ceiling = float(torch.tensor(RESET_OPACITY).logit())
         logits = self.optimiser.parameters["opacity_logits"]
         self.optimiser.overwrite("opacity_logits", logits.clamp_max(ceiling))
