@@ -180,7 +180,9 @@ class ToldSo(Field):
 
     def render(self, camera, background):
         config = self.config
-        self.config = replace(config, vd=replace(config.vd, hull_at_inference=self.told))
+        # A bare config has no hull to be told of.
+        told = self.told and config.hull is not None
+        self.config = replace(config, vd=replace(config.vd, hull_at_inference=told))
         shown = super().render(camera, background)
         self.config = config
         return shown

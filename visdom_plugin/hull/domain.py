@@ -55,26 +55,34 @@ class VisibleDomain(HullSettings):
             SceneError: when masks and cameras do not fit each other: in number or size, or, with automatic bounds,
                 because the hull covers little of the masks and would cover them with poses of another convention.
         """
-        # Settings stand on every command line: torch, numba and OpenCV are loaded when a hull is carved.
+        # Settings stand on every command line: torch and numba are loaded when a hull is carved, the check, which
+        # needs OpenCV, when it is asked.
         from visdom_plugin.hull.carving.carve import carve_silhouettes
         from visdom_plugin.hull.carving.votes import gather_silhouettes
-        from visdom_plugin.hull.checks.covisibility import advise_k
-        from visdom_plugin.hull.checks.distance_fields import draw_outlines
-        from visdom_plugin.hull.checks.explain_failure import explain_empty, find_misfit
+        from visdom_plugin.hull.checks.coverage import explains_enough
         from visdom_plugin.hull.checks.mask_checks import look_inverted
 
         log.info("carving the hull (the first time on a machine its kernels are compiled: 10 to 30 s)")
         silhouettes = gather_silhouettes(cameras, masks, self.dilate_px)
         settings = self
         if self.k == "auto" and self.kind != "released-go":
+            from visdom_plugin.hull.checks.covisibility import advise_k
+            from visdom_plugin.hull.checks.distance_fields import draw_outlines
+
             advice = advise_k(draw_outlines(cameras, silhouettes))
             log.info("k=auto takes %s", advice.why)
             settings = replace(self, k=advice.k)
         hull = carve_silhouettes(settings, cameras, silhouettes, device=getattr(masks[0], "device", "cpu"))
         if hull is None:
+            from visdom_plugin.hull.checks.explain_failure import explain_empty
+
             raise explain_empty(settings, cameras, silhouettes)
         hull = replace(hull, summary=hull.summary | {"k_asked": self.k})
-        misfit = find_misfit(settings, cameras, silhouettes, hull)
+        misfit = None
+        if not explains_enough(settings, cameras, silhouettes, hull):
+            from visdom_plugin.hull.checks.explain_failure import find_misfit
+
+            misfit = find_misfit(settings, cameras, silhouettes, hull)
         if misfit is not None:
             log.warning(misfit)
         elif not hull.summary["bounds_closed"]:

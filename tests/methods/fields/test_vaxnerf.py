@@ -16,6 +16,7 @@ from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.fields.ingp import Ingp
 from visdom_plugin.nerf.sampling.occupancy_grid import PackedSamples, select
 from visdom_plugin.training.batches import DataManager
+from visdom_plugin.training.protocols import PixelBatch
 
 CONFIG = replace(
     SMALL[Ingp],
@@ -92,8 +93,8 @@ def test_a_batch_beside_the_hull_teaches_nothing_and_breaks_nothing(scene, shard
     method = start(Ingp, scene, shards, CONFIG)
     batch = DataManager(scene.train, seed=0).pixel_batch(1, 400)
     hit = method._bound(batch.origins, batch.directions, method.hooks).hit
-    fields = {f: getattr(batch, f) for f in ("origins", "directions", "rgb", "mask", "mask_known", "radii")}
-    beside = type("Batch", (), {f: None if v is None else v[~hit] for f, v in fields.items()})
+    fields = {f: getattr(batch, f) for f in PixelBatch.__dataclass_fields__}
+    beside = PixelBatch(**{f: None if v is None else v[~hit] for f, v in fields.items()})
     assert int((~hit).sum()) > 20
     method.train_step(beside, 1).losses["colour"].backward()
     assert not method.table.grad.any()

@@ -13,7 +13,10 @@ from visdom_plugin.geometry.cameras import Cameras, rays_of
 from visdom_plugin.hull.carving.votes import Silhouettes
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
+from visdom_plugin.hull.settings import HullSettings
 
+POOR_COVERAGE = 0.7
+"""Mean share of the masks below which a hull does not explain them."""
 _RAYS, _STEPS = 512, 256
 """Of the estimate: over all views, and along each ray."""
 
@@ -41,6 +44,14 @@ def measure_coverage(hull: Hull, cameras: Cameras, masks: Sequence[Tensor | np.n
         both, of_mask, of_hull = (int(np.count_nonzero(x)) for x in (seen & mask, mask, seen))
         result.append(Coverage(both / of_mask if of_mask else 1.0, both / of_hull if of_hull else 1.0))
     return result
+
+
+def explains_enough(settings: HullSettings, cameras: Cameras, silhouettes: Silhouettes, hull: Hull) -> bool:
+    """Whether a hull covers most of its masks by a quick estimate, or was cut off on purpose."""
+    cut_off = (settings.bounds, settings.sphere_centre, settings.sphere_radius) != (None, None, None)
+    return cut_off or (
+        estimate_coverage(hull, cameras.to("cpu", dtype=torch.float64), silhouettes) >= POOR_COVERAGE
+    )
 
 
 def estimate_coverage(hull: Hull, cameras: Cameras, silhouettes: Silhouettes) -> float:

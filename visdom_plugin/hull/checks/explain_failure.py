@@ -19,7 +19,7 @@ from visdom_plugin.hull.carving.carve import carve_silhouettes
 from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Silhouettes
 from visdom_plugin.hull.checks.check import check
-from visdom_plugin.hull.checks.coverage import estimate_coverage, measure_coverage
+from visdom_plugin.hull.checks.coverage import POOR_COVERAGE, explains_enough, measure_coverage
 from visdom_plugin.hull.checks.covisibility import IN_COMMANDS, IN_PROGRAM, LEAST_K, USUAL_K
 from visdom_plugin.hull.checks.findings import Finding, Name
 from visdom_plugin.hull.hull import Hull
@@ -34,8 +34,6 @@ _COARSE = 64
 """Voxels per side of a trial hull."""
 _CONVINCING = 0.9
 """Mean share of the masks that a trial hull must cover."""
-_POOR = 0.7
-"""Mean share of the masks below which a hull does not explain them."""
 _SPECK = 1e-3
 """Of the cameras' distance: a hull smaller than this is no object that a camera was pointed at."""
 _SHOWN = 3
@@ -90,17 +88,11 @@ def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouett
     Raises:
         SceneError: when poses of another convention explain the masks, or the hull is a mere speck.
     """
-    if (
-        settings.bounds is not None
-        or settings.sphere_centre is not None
-        or settings.sphere_radius is not None
-    ):
-        return None  # cut off on purpose
-    cameras = cameras.to("cpu", dtype=torch.float64)
-    if estimate_coverage(hull, cameras, silhouettes) >= _POOR:
+    if explains_enough(settings, cameras, silhouettes, hull):
         return None
+    cameras = cameras.to("cpu", dtype=torch.float64)
     covered = _mean_coverage(hull, cameras, silhouettes)
-    if covered >= _POOR:
+    if covered >= POOR_COVERAGE:
         return None
     what = f"the hull does not explain the masks: it covers {covered:.0%} of them in the mean"
     log.info("%s; looking for the cause", what)

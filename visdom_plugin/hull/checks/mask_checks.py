@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
 from visdom_plugin.hull.checks.findings import Finding, Name
@@ -142,6 +141,9 @@ def border_contact(mask: np.ndarray) -> float:
 
 def count_specks(mask: np.ndarray) -> tuple[int, float]:
     """Pixels that differ from all eight neighbours: how many, and how many per pixel of outline."""
+    # Carving a hull needs this module, and does without OpenCV.
+    import cv2
+
     mask = mask.astype(np.uint8)
     around = cv2.boxFilter(mask, cv2.CV_16S, (3, 3), normalize=False, borderType=cv2.BORDER_REPLICATE)
     specks = int(
