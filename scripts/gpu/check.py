@@ -13,6 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -58,7 +59,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         "--reference", type=Path, help="results.json of `--device cpu train`, to compare with"
     )
     parser.add_argument("--resume", type=Path, help="OUT of an earlier call: results are kept, runs go on")
-    parser.add_argument("--work", type=Path, default=Path("/tmp/visdom-gpu"), help="where all else is put")
+    scratch = Path(tempfile.gettempdir()) / "visdom-gpu"
+    parser.add_argument("--work", type=Path, default=scratch, help="where all else is put")
     parser.add_argument("--only", help="cases whose name contains this word")
     args = parser.parse_intermixed_args(argv)
     for part in args.parts:
