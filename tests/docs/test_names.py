@@ -56,10 +56,12 @@ def test_named_modules_exist(name):
 
 
 def test_the_search_finds_what_is_wrong():
-    assert PATH.findall("see `visdom_plugin/hull/hull.py`, (tests/hosts/) and benchmarks/raycast.py.") == [
+    assert PATH.findall(
+        "see `visdom_plugin/hull/hull.py`, (tests/hosts/) and benchmarks/hull/raycast.py."
+    ) == [
         "visdom_plugin/hull/hull.py",
         "tests/hosts/",
-        "benchmarks/raycast.py",
+        "benchmarks/hull/raycast.py",
     ]
     assert is_there("visdom_plugin/hull/hull.py") and not is_there("visdom_plugin/cameras.py")
     assert names_something("visdom_plugin.Hull") and names_something("visdom_plugin.hull.hull.Hull.save")

@@ -1,4 +1,4 @@
-"""Quality in frames far from the origin: python benchmarks/far_frames.py ingp+vd 3dgs-go+vd
+"""Quality in frames far from the origin: python benchmarks/methods/far_frames.py ingp+vd 3dgs-go+vd
 
 The built-in scene is shifted, as coordinates of a survey would be, and each method trains its `quick`
 preset there. The PSNR of the test views should not depend on the shift beyond the rounding of the poses

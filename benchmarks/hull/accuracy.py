@@ -1,6 +1,6 @@
 """How close each hull comes to the exact surface of the built-in scene, and what a grid costs on disk.
 
-    python benchmarks/hull_quality.py [--views 4 6 9] [--resolution 256] [--samples 200000]
+    python benchmarks/hull/accuracy.py [--views 4 6 9] [--resolution 256] [--samples 200000]
 
 Chamfer distance: mean of the two mean distances between points drawn evenly on both surfaces, in per cent of the
 object's diagonal. "outside" is the part of it from the hull to the object, "missed" the part from the object to

@@ -1,6 +1,6 @@
 """Rays per second against a 256^3 hull: voxel traversal, torch marching, and trimesh on the hull's mesh.
 
-python benchmarks/raycast.py [--rays 2000000]
+python benchmarks/hull/raycast.py [--rays 2000000]
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import argparse
 
 import numpy as np
 import torch
-from hull import capture, least
+from carve import capture, least
 
 from visdom_plugin.geometry.cameras import rays_of
 from visdom_plugin.hull.domain import VisibleDomain

@@ -1,7 +1,7 @@
 """Quality of methods over scenes, views and seeds: each cell is one `visdom-train` command.
 
-    python benchmarks/quality.py --methods 3dgs-go 3dgs-go+mask 3dgs-go+vd --views 4 6 9 --seeds 0 1 2
-    python benchmarks/quality.py --data $VISDOM_SCENES/blowtorch --downscale 4 --methods 3dgs-go+vd
+    python benchmarks/methods/quality.py --methods 3dgs-go 3dgs-go+mask 3dgs-go+vd --views 4 6 9 --seeds 0 1 2
+    python benchmarks/methods/quality.py --data $VISDOM_SCENES/blowtorch --downscale 4 --methods 3dgs-go+vd
 
 Words after `--` go to every `visdom-train` as they are: `-- --method.vd.weight 0.1`. Finished cells are read,
 not trained again. Prints one Markdown row per scene, number of views and method: mean over seeds of the mean

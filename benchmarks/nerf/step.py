@@ -1,6 +1,6 @@
 """A training step of each radiance field with the sampler against the same without, pairwise in one run.
 
-    python benchmarks/nerf_step.py --method ingp --steps 200
+    python benchmarks/nerf/step.py --method ingp --steps 200
 
 Both have the same number of rays per step. Two settings: "same spacing" leaves all else equal, so that samples
 lie as close in both and the shorter interval holds fewer; "preset" is what `+vd` and the bare variant train with.

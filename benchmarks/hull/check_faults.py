@@ -1,7 +1,7 @@
 """What `visdom-check` finds: faults planted into the built-in scene and real ones, and what sound scenes are told.
 
-    python benchmarks/check_faults.py --views 4 6 9
-    python benchmarks/check_faults.py --scenes built-in vgg_dinosaur synthetic_lego --downscale 4 --clean all
+    python benchmarks/hull/check_faults.py --views 4 6 9
+    python benchmarks/hull/check_faults.py --scenes built-in vgg_dinosaur synthetic_lego --downscale 4 --clean all
 
 Scenes are folders in VISDOM_SCENES. A fault counts as found when a finding of the right kind names every view
 concerned: alone ("+", with how sure) or as one of several suspects or causes ("~": nothing in the masks can tell
@@ -17,7 +17,7 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from datamodules import load
 from tests.hull.checks.faults import FAULTS, Capture, capture_of, clustered, judge

@@ -1,7 +1,7 @@
 """One sheet of test views, a row per finished run and the truth on top.
 
     cd runs/quality/built-in/4
-    python ../../../../benchmarks/compare_pictures.py --out sheet.png 3dgs-go/0 3dgs-go+mask/0 3dgs-go+vd/0
+    python ../../../../benchmarks/methods/compare_pictures.py --out sheet.png 3dgs-go/0 3dgs-go+mask/0 3dgs-go+vd/0
 
 The runs must be of one scene; the truth is loaded as the first run's was.
 """

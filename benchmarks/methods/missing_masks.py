@@ -1,6 +1,6 @@
 """What views without a mask are good for: 3dgs-go(+vd) on the built-in scene with some training masks taken away.
 
-    python benchmarks/missing_masks.py [--views 6] [--without 2] [--size 100] [--steps 400] [--vd]
+    python benchmarks/methods/missing_masks.py [--views 6] [--without 2] [--size 100] [--steps 400] [--vd]
 
 Prints test metrics with all masks (the reference), with the views left out, and with them as colour and as hull.
 """

@@ -1,6 +1,6 @@
 """Time of one training step of Gaussian splatting on the CPU, against a dense torch rasteriser in the same run.
 
-    python benchmarks/splat.py [--repeats 15]
+    python benchmarks/splat/step.py [--repeats 15]
 
 A step is forward, 0.8 L1 + 0.2 (1 - SSIM), backward, and torch's fused Adam over all parameters, harmonics of
 degree 3. The Gaussians cover a sphere that fills most of the image. Times are the least of the repeats.

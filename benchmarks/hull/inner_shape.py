@@ -1,6 +1,6 @@
 """How well hulls and the shapes inside them fit training and unseen masks.
 
-    python benchmarks/inner_shape.py [--data DIR ...] [--views 4] [-k 3] [--downscale 4] [--radius 2 ...]
+    python benchmarks/hull/inner_shape.py [--data DIR ...] [--views 4] [-k 3] [--downscale 4] [--radius 2 ...]
 
 Prints for hull and inner shape of every scene the silhouette IoU in training and in test views (means over views),
 the least share of a training mask that is covered, the volume as a share of the hull's, and the seconds. Without

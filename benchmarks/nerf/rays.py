@@ -1,6 +1,6 @@
 """Time of a NeRF's work on rays, hash grid and nets apart: kernels for the CPU against the same in plain torch.
 
-    python benchmarks/nerf_rays.py [--rays 1024] [--repeats 15]
+    python benchmarks/nerf/rays.py [--rays 1024] [--repeats 15]
 
 Both forms run in turn in one process; times are the least of the repeats. Losses and rendering include backward.
 """

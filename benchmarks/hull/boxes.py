@@ -1,6 +1,6 @@
 """How well the automatic box fits the object, with each way to choose among the pieces of a hull.
 
-    python benchmarks/hull_boxes.py [DIR ...] [--views 4 6 9] [--resolution 256]
+    python benchmarks/hull/boxes.py [DIR ...] [--views 4 6 9] [--resolution 256]
 
 Without DIR: the built-in scene. The object is the largest piece of the hull from the most views. Printed are the
 extent of what is kept over that of the object for each axis, and the least and the mean share of a mask covered.

@@ -1,6 +1,6 @@
 """Import time of the public API over `import torch, numpy, numba`, which it stands on.
 
-    python benchmarks/import_time.py [runs]
+    python benchmarks/system/import_time.py [runs]
 
 Fresh interpreters, one after the other in turn; the fastest of each counts.
 """

@@ -1,7 +1,7 @@
 """Opening a 48-view scene for 4 training views, against decoding everything one after another; and reading a
 large COLMAP model, against unpacking it number by number.
 
-    python benchmarks/load_scene.py [--data DIR] [--views 4] [--downscale 1] [--repeat 7]
+    python benchmarks/system/load_scene.py [--data DIR] [--views 4] [--downscale 1] [--repeat 7]
 
 Without --data a scene of 48 photographs of 800 x 800 is written to a temporary folder (half PNG, half JPEG), and
 a model of 300 images with 2000 points each and 200,000 points in space. Ratios are against the reference of the

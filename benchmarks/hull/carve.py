@@ -1,6 +1,6 @@
 """Speed and memory of the hull: block carve against the dense torch votes, and its growth with resolution.
 
-    python benchmarks/hull.py [--resolutions 128 256 512 1024] [--repeats 5]
+    python benchmarks/hull/carve.py [--resolutions 128 256 512 1024] [--repeats 5]
 
 Nine views of 800 x 800 of an object with a hole; the reference is measured in the same run. Each resolution is
 carved in a process of its own, so that its peak memory is its own. Times are the least of several runs.

@@ -1,6 +1,6 @@
 """Kills visdom-table's driver, or one of its workers, at random moments; the table must be as if it had not.
 
-python benchmarks/table_kills.py --kills 10 [--steps 20] [--seed S]
+python benchmarks/system/table_kills.py --kills 10 [--steps 20] [--seed S]
 
 One table is made in one go. Then the same table is made again, while after random times the driver and one of its
 workers get SIGKILL in turn; a killed driver is started again at once. table.csv and table.md must be the same byte

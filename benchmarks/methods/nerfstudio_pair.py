@@ -1,6 +1,6 @@
 """Nerfstudio's nerfacto beside nerfacto-vd: same photographs, same steps, same small size, measured by ns-eval.
 
-    python benchmarks/nerfstudio_pair.py --data SCENE --steps 300
+    python benchmarks/methods/nerfstudio_pair.py --data SCENE --steps 300
 
 runs in an environment of scripts/nerfstudio_env.sh, on the CPU. What runs is `ns-train` and `ns-eval` word for
 word; the commands are printed. Bare nerfacto sees the photographs on white and draws on white; both take the

@@ -1,6 +1,6 @@
 """Speed of the hash encoding on the CPU, forward and backward, against the plain torch version of the same run.
 
-    python benchmarks/hash_grid.py [--repeats 10] [--one-thread]
+    python benchmarks/nerf/hash_grid.py [--repeats 10] [--one-thread]
 
 Points lie along random rays, 32 (groups of) points each, as in training. Times are the least of several runs,
 taken in turns; "ns" is wall time per point, level and corner. Features are compared before anything is timed.
