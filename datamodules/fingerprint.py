@@ -16,7 +16,7 @@ from datamodules.files.paths import inside, read_plain
 from datamodules.open_scene import Chosen, choose_files
 from datamodules.recognise import opening, read_capture
 from datamodules.request import Request
-from datamodules.views.reader import spread_out
+from datamodules.views.reader import map_on_cores
 from visdom_plugin.errors import SceneError
 
 
@@ -60,7 +60,7 @@ def take_fingerprint(
         names = list(dict.fromkeys(list_files(capture, chosen)))
         paths = [inside(capture.root, name, outside=request.allow_outside) for name in names]
         new = [p for p in dict.fromkeys(paths) if p not in known]
-        known.update(zip(new, spread_out(lambda i: hash_file(new[i]), range(len(new))), strict=True))
+        known.update(zip(new, map_on_cores(lambda i: hash_file(new[i]), range(len(new))), strict=True))
     split = chosen.split
     content = {
         "layout": capture.layout,

@@ -26,7 +26,7 @@ from datamodules.views import splits
 from datamodules.views.find_files import ImageFiles
 from datamodules.views.lazy import LaterViews
 from datamodules.views.mask_files import assign_masks, find_ignored, looks_inverted
-from datamodules.views.reader import ViewReader, spread_out
+from datamodules.views.reader import ViewReader, map_on_cores
 from visdom_plugin.errors import SceneError, list_some
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.scene import Scene, Views
@@ -95,8 +95,8 @@ def open_capture(capture: Capture, request: Request) -> Scene:
     calibration = capture.calibrate([*split.train, *split.test])
     reader = ViewReader(files, calibration, factor, request.downscale / capture.shrunk, capture, request)
     n = len(split.train)
-    loaded = spread_out(reader.read, range(n))
-    later = LaterViews(lambda i: reader.read(n + i), spread_out(reader.inspect, range(n, len(files))))
+    loaded = map_on_cores(reader.read, range(n))
+    later = LaterViews(lambda i: reader.read(n + i), map_on_cores(reader.inspect, range(n, len(files))))
     sizes = [(v.image.shape[1], v.image.shape[0]) for v in loaded] + [v.size for v in later.inspected]
     cameras = calibration.cameras.resized(*torch.tensor(sizes).reshape(-1, 2).unbind(1))
     train = _views(cameras[:n], loaded, [names[i] for i in split.train])

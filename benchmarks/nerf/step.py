@@ -16,7 +16,8 @@ from dataclasses import replace
 
 import torch
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from visdom_plugin import registry
 from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.run import build

@@ -100,7 +100,7 @@ def read(root: Path, request: Request) -> Capture:
 def hold_out(rows: Sequence[int]) -> Pools:
     """30 of 160 cameras for testing, evenly spread, in proportion for fewer; the others may train."""
     count = min(round(len(rows) * _HELD_OUT / _ALL), _HELD_OUT)
-    test = splits.spread(rows, count) if count else []
+    test = splits.pick_evenly(rows, count) if count else []
     rule = f"{count} of {len(rows)} cameras held out, evenly spread"
     return Pools(tuple(i for i in rows if i not in set(test)), tuple(test), rule)
 

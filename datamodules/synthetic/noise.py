@@ -43,8 +43,8 @@ def disturb_masks(masks: Sequence[Tensor], config: SyntheticConfig) -> list[Tens
     """Masks eroded, then dilated (by discs of `erode_px` and `dilate_px`), then with pixels turned over."""
     changed = []
     for i, mask in enumerate(masks):
-        mask = _spread(~mask, config.erode_px).logical_not() if config.erode_px else mask
-        mask = _spread(mask, config.dilate_px) if config.dilate_px else mask
+        mask = _grow(~mask, config.erode_px).logical_not() if config.erode_px else mask
+        mask = _grow(mask, config.dilate_px) if config.dilate_px else mask
         if config.flip_fraction:
             draw = generator(config.seed, "synthetic", "flips", i)
             mask = mask ^ (torch.rand(mask.shape, generator=draw) < config.flip_fraction)
@@ -52,7 +52,7 @@ def disturb_masks(masks: Sequence[Tensor], config: SyntheticConfig) -> list[Tens
     return changed
 
 
-def _spread(mask: Tensor, radius: int) -> Tensor:
+def _grow(mask: Tensor, radius: int) -> Tensor:
     """Every pixel within `radius` (Euclidean) of a True one; nothing comes in over the image's border."""
     import cv2
 

@@ -42,7 +42,7 @@ def every_eighth(positions: Sequence[int]) -> Pools:
     return Pools(tuple(i for i in positions if i not in test), test, "every 8th view is for testing")
 
 
-def spread(pool: Sequence[int], count: int) -> list[int]:
+def pick_evenly(pool: Sequence[int], count: int) -> list[int]:
     """`count` members of `pool`, the first and the last among them, at even steps (halves rounded up)."""
     if count == 1:
         return [pool[0]]
@@ -111,14 +111,14 @@ def choose(
                 "%s: %d views are all but those for testing, so these are taken as well", root, len(pool)
             )
             pool, rules = every, [*rules[:-1], "no view is held out"]
-        train, rule = _spread(root, names, pool, every, request.views)
+        train, rule = _pick_training(root, names, pool, every, request.views)
         rules.append(rule)
     tested = held if request.test else []
     _refuse_shared(train, tested, f"{train_where} and {test_where}", root)
     return Split(train, tested, hashes, "; ".join(rules))
 
 
-def _spread(
+def _pick_training(
     root: Path, names: Sequence[str], pool: list[int], every: list[int], views: int | None
 ) -> tuple[list[int], str]:
     """Views of the pool, and the rule in words; `every` holds those that could be listed by hand."""
@@ -126,7 +126,7 @@ def _spread(
     if not pool or not 1 <= wanted <= len(pool):
         todo = f"pass --views with 1 to {len(pool)}" if pool else "choose by hand with --train-list"
         if len(pool) < wanted <= min(len(every), _LISTED):
-            by_hand = ",".join(map(str, spread(every, wanted)))
+            by_hand = ",".join(map(str, pick_evenly(every, wanted)))
             todo += f"; or train on views that are for testing, too: --train-list {by_hand}"
             if wanted == len(names):
                 todo += " (where no view is left to test on, visdom-eval --leave-one-out measures)"
@@ -137,7 +137,7 @@ def _spread(
             where=root,
             todo=todo,
         )
-    train = spread(pool, wanted)
+    train = pick_evenly(pool, wanted)
     log.info(
         "%s: no index file for %d views; they are spread evenly over the %d free ones: %s",
         root,

@@ -12,7 +12,7 @@ _HOME = {
     "Gaussians": "visdom_plugin.splat.gaussians",
     "HashLayout": "visdom_plugin.nerf.encoding.hash_layout",
     "OccupancyGrid": "visdom_plugin.nerf.sampling.occupancy_grid",
-    "SyntheticConfig": "datamodules.synthetic.scene",
+    "SyntheticConfig": "datamodules.synthetic.config",
     "DataManager": "visdom_plugin.training.batches",
     "build": "visdom_plugin.training.run",
     "cast": "visdom_plugin.hull.queries.raycast",

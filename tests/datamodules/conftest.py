@@ -1,6 +1,7 @@
 import pytest
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from tests.datamodules.layouts.prepared_writer import write_prepared
 
 

@@ -13,7 +13,8 @@ import torch
 
 from datamodules import load
 from datamodules.fingerprint import hash_file, take_fingerprint
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from tests.datamodules.layouts import layout_writers as w
 from tests.datamodules.layouts.prepared_writer import write, write_prepared
 from visdom_plugin.errors import ConfigError, SceneError

@@ -22,7 +22,8 @@ def blocks(page: Path) -> list[tuple[int, str]]:
 
 def what_the_readme_presupposes() -> dict:
     """The README's reader brings arrays, rays, a loss and a way to draw: here, of the built-in scene."""
-    from datamodules.synthetic.scene import SyntheticConfig, make_scene
+    from datamodules.synthetic.config import SyntheticConfig
+    from datamodules.synthetic.scene import make_scene
     from visdom_plugin import Render
     from visdom_plugin.geometry.cameras import rays_of
 

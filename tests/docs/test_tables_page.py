@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from tests.datamodules.layouts.prepared_writer import write_prepared
 from visdom_plugin.cli.commands import table
 from visdom_plugin.tables.spec import load_table

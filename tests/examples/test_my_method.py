@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "my_method"
 

@@ -28,7 +28,8 @@ import torch
 from datamodules.files import colmap_model, colmap_points, images, masks
 from datamodules.layouts import actorshq, llff, transforms
 from datamodules.request import Request
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from datamodules.views import splits
 from tests.datamodules.layouts import layout_writers as w
 from tests.fuzz.mutate import damage, damage_json, damage_png

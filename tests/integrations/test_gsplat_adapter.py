@@ -6,7 +6,8 @@ from functools import partial
 import pytest
 import torch
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from visdom_plugin import Hull, VisDomGaussianRegularizer, VisibleDomain
 from visdom_plugin.errors import CheckpointError, ConfigError
 from visdom_plugin.integrations.gsplat import FADED_OPACITY, VisDomStrategy, draw_opacity, info_of

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from method_configs import corgs_lite, gs_go, ingp, zipnerf_lite
 from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.hull.domain import VisibleDomain

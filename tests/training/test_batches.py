@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import project
 from visdom_plugin.scene import Views

@@ -7,7 +7,8 @@ import pytest
 import torch
 import trimesh
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from visdom_plugin import registry
 from visdom_plugin.errors import CheckpointError
 from visdom_plugin.geometry.local_frame import local_origin

@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from method_configs.gs_go import SPEC
 from visdom_plugin.errors import SceneError
 from visdom_plugin.hull.domain import VisibleDomain

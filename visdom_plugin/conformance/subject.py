@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from visdom_plugin.conformance.report import require
 from visdom_plugin.errors import list_some
 from visdom_plugin.registry import Preset, Registry

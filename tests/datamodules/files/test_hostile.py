@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from datamodules import load
 from datamodules.files.parsers import parse_json, parse_npy
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from tests.datamodules.layouts import layout_writers as w
 from tests.fuzz.fuzz_readers import judge, make_case, make_readers
 from tests.fuzz.mutate import damage, damage_json

@@ -12,7 +12,8 @@ import torch
 from datamodules import load
 from datamodules.layouts import actorshq
 from datamodules.recognise import FORMATS, recognise
-from datamodules.synthetic.scene import SyntheticConfig, _draw, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import _draw, make_scene
 from datamodules.synthetic.shape import watering_can
 from tests.datamodules.layouts import layout_writers as w
 from tests.datamodules.layouts.prepared_writer import write

@@ -12,9 +12,10 @@ import torch
 import trimesh
 
 from datamodules import load
+from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.noise import disturb_poses
 from datamodules.synthetic.render import rasterise
-from datamodules.synthetic.scene import SyntheticConfig, make_scene, to_world
+from datamodules.synthetic.scene import make_scene, to_world
 from datamodules.synthetic.shape import watering_can
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import project, rays_of

@@ -10,7 +10,7 @@ import torch
 
 from datamodules import load
 from datamodules.files import images
-from datamodules.views.reader import spread_out
+from datamodules.views.reader import map_on_cores
 from tests.datamodules.layouts.prepared_writer import write
 from visdom_plugin.errors import SceneError
 from visdom_plugin.training.runs.run_directory import hash_views
@@ -84,8 +84,8 @@ def test_the_first_error_in_order_is_told():
 
     for _ in range(5):
         with pytest.raises(ValueError, match="3"):
-            spread_out(fail, range(3, 40))
-    assert spread_out(lambda i: i * i, range(5)) == [0, 1, 4, 9, 16]
+            map_on_cores(fail, range(3, 40))
+    assert map_on_cores(lambda i: i * i, range(5)) == [0, 1, 4, 9, 16]
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the process's memory from /proc")

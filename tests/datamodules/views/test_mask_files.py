@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from datamodules import load
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from tests.datamodules.layouts import layout_writers as w
 from visdom_plugin.errors import SceneError
 

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from datamodules import load
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from tests.hull.balls import box_masks, ring
 from tests.hull.checks.faults import FAULTS, Capture, capture_of, clustered, judge, seen_alone
 from visdom_plugin.geometry.cameras import Cameras, project

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from tests.hull.balls import ball_masks, box_masks, moved, random_cameras, ring
 from visdom_plugin.errors import EmptyHullError, SceneError
 from visdom_plugin.geometry.cameras import Cameras

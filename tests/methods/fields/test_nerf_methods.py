@@ -7,7 +7,8 @@ import pytest
 import torch
 import trimesh
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from method_configs import ingp, zipnerf_lite
 from tests.methods.short_runs import advance, copy_of, set_up
 from visdom_plugin import registry

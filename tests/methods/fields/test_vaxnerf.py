@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from method_configs import vaxnerf, zipnerf_lite
 from method_configs.ingp import SPEC
 from tests.methods.fields.test_nerf_methods import SMALL, advance, start

@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from method_configs.corgs_lite import SPEC
 from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.errors import SceneError

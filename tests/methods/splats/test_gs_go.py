@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from method_configs.gs_go import SPEC
 from tests.methods.short_runs import advance, set_up
 from visdom_plugin.hooks.configs import RegularizerConfig

@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from method_configs import corgs_lite, gs_go
 from visdom_plugin.geometry.cameras import look_at_point
 from visdom_plugin.methods.splats.corgs_lite import CorgsLite

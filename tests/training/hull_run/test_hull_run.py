@@ -9,7 +9,8 @@ import torch
 import trimesh
 
 from datamodules.files.target_mesh import find_mesh, load_mesh
-from datamodules.synthetic.scene import SyntheticConfig, make_scene
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
 from visdom_plugin.cli.hulls import measure_hull as command
 from visdom_plugin.errors import CheckpointError, EmptyHullError, SceneError
 from visdom_plugin.hull.domain import VisibleDomain

@@ -1,0 +1,176 @@
+"""What lies beside a photograph: its mask, ignored pixels and depth, brought into the photograph's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from datamodules.capture import ViewFiles
+from datamodules.files import images, masks
+from datamodules.views import orientation
+from datamodules.views.photograph_files import Photograph, Reading
+from visdom_plugin.errors import SceneError
+
+ChooseTurns = Callable[[], tuple[int, bool]]
+"""For files that fit their photograph turned and not: which way most do, and whether that is clear."""
+
+
+def read_mask(
+    reading: Reading, file: ViewFiles, photo: Photograph, choose_turns: ChooseTurns
+) -> tuple[np.ndarray | None, Path, tuple[str, ...]]:
+    """(H, W) float32 opacity at the file's own size, the file, and remarks; None where there is no mask."""
+    source, alpha = reading.request.mask_source, None
+    if photo.alpha and source != "folder":
+        alpha = masks.decode_alpha(images.decode_any(photo.data, photo.path))
+        alpha = alpha and alpha._replace(opacity=photo.turn(alpha.opacity))
+    if source == "alpha" or (file.mask is None and source != "folder"):
+        return (None if alpha is None else alpha.opacity), photo.path, ()
+    if file.mask is None:
+        return None, photo.path, ()
+    found, path, remarks = _read_turned(reading, file.mask, photo, "mask", choose_turns)
+    if alpha is not None:
+        masks.refuse_two(found, alpha, path, photo.path)
+    return found.opacity, path, remarks
+
+
+def read_ignored(
+    reading: Reading, file: ViewFiles, photo: Photograph, choose_turns: ChooseTurns
+) -> np.ndarray | None:
+    """(H, W) bool at the photograph's size, True where nothing is known; None where everything is."""
+    ignore = None
+    for relative, black_is_unknown in ((file.ignore, True), (file.excluded, False)):
+        if relative is not None:
+            values = _read_turned(reading, relative, photo, "mask of ignored pixels", choose_turns)[0].opacity
+            unknown = values <= 0.5 if black_is_unknown else values > 0
+            unknown = resize(unknown.astype(np.float32), *photo.size) > 0
+            ignore = unknown if ignore is None else ignore | unknown
+    return ignore if ignore is not None and ignore.any() else None
+
+
+def read_depth(
+    reading: Reading, file: ViewFiles, full: tuple[int, int], target: tuple[int, int]
+) -> Tensor | None:
+    """(H, W) float32 monocular depth at the target's size; None where the view has none.
+
+    Args:
+        full: width and height that the camera says.
+        target: width and height that are wanted.
+
+    Raises:
+        SceneError: the file is damaged, or has another shape than the camera.
+    """
+    path = None if file.depth is None else reading.find(file.depth)
+    if path is None or not path.is_file():
+        return None
+    data = images.read_file(path)
+    size = images.read_header(data, path).size
+    if abs(size[0] * full[1] - size[1] * full[0]) > max(full):
+        raise SceneError(
+            f"the depth map is {size[0]} x {size[1]}, another shape than its image's {full[0]} x {full[1]}",
+            where=path,
+            todo="make the depth map from the image, or remove it",
+        )
+    return torch.from_numpy(images.shrink_nearest(images.decode_depth(data, path), *target))
+
+
+def resize(soft: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Area average where the picture gets smaller, else the nearest value."""
+    if soft.shape[0] >= height and soft.shape[1] >= width:
+        return images.shrink(soft, width, height)
+    return images.shrink_nearest(soft, width, height)
+
+
+def refuse_unmasked(reading: Reading, file: ViewFiles, path: Path) -> None:
+    """Raises SceneError about a view that has no mask, with what there is in its place."""
+    if file.ignore is not None:
+        raise SceneError(
+            f"the photograph has no foreground mask: {file.ignore} says which pixels to ignore",
+            where=path,
+            cause="mask_path has nerfstudio's meaning here",
+            todo="pass --mask-path foreground if these files are white on the object",
+        )
+    folder = reading.mask_folder
+    missing = folder is not None and not (reading.root / folder).is_dir()
+    raise SceneError(
+        f"the folder {folder} is missing" if missing else "the photograph has no mask",
+        where=reading.root if missing else path,
+        cause="and the photographs have no alpha channel to take its place" if missing else None,
+        todo="put one PNG per image there, white on the object, named like the image"
+        if folder is not None
+        else "save the photographs as PNG with an alpha channel that is opaque on the object",
+    )
+
+
+class SideFile(NamedTuple):
+    """A file beside a photograph whose header has been read."""
+
+    data: bytes
+    path: Path
+    turns: list[orientation.Turns]
+    """Ways in which it can be turned to fit its photograph."""
+
+
+def open_side_file(reading: Reading, relative: str, photo: Photograph, what: str) -> SideFile:
+    """Reads the header of a mask or of ignored pixels.
+
+    Args:
+        what: what the file is, for messages.
+
+    Raises:
+        SceneError: it is missing or damaged, or has another shape than its photograph.
+    """
+    path = reading.find(relative)
+    data = images.read_file(path)
+    header = images.read_header(data, path)
+    ways = orientation.possible_turns(photo.orientation, photo.turned, header.orientation)
+    ways = [turns for turns in ways if masks.fits(orientation.turned_size(header.size, turns), photo.size)]
+    if ways:
+        return SideFile(data, path, ways)
+    width, height = header.size
+    sideways = masks.fits((height, width), photo.size)
+    raise SceneError(
+        f"the {what} is {width} x {height} but its image is {photo.size[0]} x {photo.size[1]}",
+        where=path,
+        cause=f"the {what} or the image was turned by a quarter, and says nothing of it"
+        if sideways
+        else f"the {what} was made of another image: one cropped, or not undistorted as this one is",
+        todo=f"turn the {what} by a quarter"
+        if sideways
+        else f"make the {what} from the image, at any size of the same shape",
+    )
+
+
+def score_turns(reading: Reading, mask: str, photo: Photograph) -> list[list[float]]:
+    """`outline_contrast` in each way that a mask's size allows, as a row; no row where there is but one way."""
+    other = open_side_file(reading, mask, photo, "mask")
+    if len(other.turns) == 1:
+        return []
+    image, opacity = photo.decode(), masks.decode_mask(other.data, other.path).opacity
+    return [[orientation.outline_contrast(image, orientation.apply(opacity, turns)) for turns in other.turns]]
+
+
+def _read_turned(
+    reading: Reading, relative: str, photo: Photograph, what: str, choose_turns: ChooseTurns
+) -> tuple[masks.Mask, Path, tuple[str, ...]]:
+    """A mask's pixels in its photograph's frame, its file, and what is to be said of how they were turned."""
+    other = open_side_file(reading, relative, photo, what)
+    way, clear = choose_turns() if len(other.turns) > 1 else (0, True)
+    turns, remarks = other.turns[way], []
+    if not clear:
+        remarks.append(
+            f"photographs with EXIF orientation {photo.orientation}, whose masks may be turned against them: "
+            "neither sizes nor outlines tell; the pixels are taken as they are stored"
+        )
+    elif turns and photo.orientation > 1:
+        remarks.append(
+            f"masks turned to match their photographs, which have EXIF orientation {photo.orientation}"
+        )
+    elif turns:
+        remarks.append(f"masks turned by their EXIF orientation {turns[0]}")
+    found = masks.decode_mask(other.data, other.path)
+    return found._replace(opacity=orientation.apply(found.opacity, turns)), other.path, tuple(remarks)
