@@ -166,17 +166,20 @@ class VisDomGaussianRegularizer:
     def initial_points(self, n: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
         """Points to start from: xyz (n, 3) world frame and rgb (n, 3) in [0, 1], on the device of the cameras.
 
+        They lie in `hull.inner`, the shape inside the hull, where the hull has one; in the hull itself without.
+
         Both are float32; only where the hull is so far from the origin that float32 would move points, xyz is
         float64. Trainers in float32 want `hull.relative_to(origin)` and `cameras.relative_to(origin)` there.
         """
-        draw = self.hull.sample_points if self.config.points == "surface" else self.hull.sample_inside
+        shape = self.hull.inner or self.hull
+        draw = shape.sample_points if self.config.points == "surface" else shape.sample_inside
         xyz = draw(n, generator)
         if is_near(self.hull.extent, float(np.ptp(self.hull.extent, axis=0).max())):
             xyz = xyz.float()
         if self.images is None:
             rgb = torch.full(xyz.shape, 0.5)
         else:
-            rgb = colour_points(self.hull, xyz, self.cameras, self.images)
+            rgb = colour_points(shape, xyz, self.cameras, self.images)
         return xyz.to(self._device), rgb.to(self._device)
 
     def sample_camera(self, generator: Generator | None = None) -> Cameras:

@@ -37,6 +37,9 @@ class Hull:
     """(2, 3) float64 lower and upper corner of the grid, world frame. Read-only."""
     summary: dict[str, Any] = field(default_factory=dict)
     """How it was carved: rule, views, seconds, components; plain numbers and strings."""
+    inner: Hull | None = None
+    """The shape inside it, where somebody found it (`hull.inside.shape.shape_inside`): where Gaussians may start.
+    The hull itself is what is certain, and is all that `save` writes."""
     _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -87,7 +90,10 @@ class Hull:
     def relative_to(self, origin: np.ndarray | Sequence[float]) -> Hull:
         """The same hull in the frame that has its origin at `origin` (3,), with the same axes; itself for zero."""
         shift = np.asarray(origin, np.float64)
-        return Hull(self.occupancy, self.bounds - shift, self.summary) if shift.any() else self
+        if not shift.any():
+            return self
+        inner = None if self.inner is None else self.inner.relative_to(shift)
+        return Hull(self.occupancy, self.bounds - shift, self.summary, inner)
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -23,6 +23,7 @@ from visdom_plugin.training.protocols import Method
 from visdom_plugin.training.runs import checkpoints
 from visdom_plugin.training.runs.config_io import as_plain, differences
 from visdom_plugin.training.runs.run_directory import RunDir, describe_data
+from visdom_plugin.training.runs.saved_hulls import REFERENCE, find_hull, read_hull, write_hull
 from visdom_plugin.training.trainer import Trainer, view_psnr
 
 if TYPE_CHECKING:
@@ -32,10 +33,6 @@ log = logging.getLogger(__name__)
 
 DataManager = Callable[[Views, int, torch.device], Any]
 """(training views, seed, device) to an object whose `view_batch(step)` and `pixel_batch(step, n)` are pure."""
-
-
-HULL, REFERENCE = "hull.npz", "reference.npz"
-"""In a run's folder hull/: the hull of its method, and that of its metrics where it is another."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -190,10 +187,8 @@ def build(
     Args:
         saved: the folder in which the run keeps its hull, if it has one already: it is read, not carved again.
     """
-    hull, began = None, time.monotonic()
-    if getattr(config, "hull", None) is not None:
-        hull = read_hull(saved / HULL) if saved is not None else None
-        hull = config.hull.carve(*views.silhouettes()) if hull is None else hull
+    began = time.monotonic()
+    hull = find_hull(config, views, saved)
     hull_s = time.monotonic() - began
     near = move_near(views)
     near_hull = hull if hull is None or near is views else hull.relative_to(near.origin.numpy())
@@ -273,29 +268,6 @@ def evaluate_again(
         timing = run.record.get("timing", {}) | {"eval_s": time.monotonic() - began}
         run.update(metrics=finite(found), timing=timing)
         return run.record
-
-
-def write_hull(hull: Any, folder: Path) -> None:
-    """hull.npz and hull.ply, each in one step; files that are there already are of the same run."""
-    if not (folder / HULL).exists():
-        with appearing(folder / HULL) as part:
-            hull.save(part)
-    if not (folder / "hull.ply").exists():
-        with appearing(folder / "hull.ply") as part:
-            hull.write_ply(part)
-
-
-def read_hull(path: Path) -> Hull | None:
-    """A hull that a run has saved; None where there is none, or, with a warning, where it cannot be read."""
-    from visdom_plugin.hull.hull import Hull
-
-    if not path.exists():
-        return None
-    try:
-        return Hull.load(path)
-    except CheckpointError as error:
-        log.warning("%s\n  the hull is carved again", error)
-        return None
 
 
 def export(method: Method, folder: Path) -> list[Path]:

@@ -7,12 +7,28 @@ from typing import Literal
 
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.inside.config import InsideConfig
 from visdom_plugin.splat.set_config import GaussianSetConfig
 from visdom_plugin.validation import demand
 
 
 @dataclass(frozen=True)
-class GsGoConfig(GaussianSetConfig):
+class HullStartConfig(GaussianSetConfig):
+    """Where Gaussians start, and the visible-domain hook."""
+
+    hull: VisibleDomain | None = field(default_factory=lambda: VisibleDomain(kind="released-go"))
+    """Where the Gaussians start; None for the points of structure from motion, where the scene has them."""
+    initial_shape: Literal["hull", "inside"] = "hull"
+    """Whether they start in the hull itself or in the smoothest full shape inside it that has its silhouettes. The
+    hull stays what the hook's loss, the removal of Gaussians and the metrics go by."""
+    inside: InsideConfig = field(default_factory=InsideConfig)
+    """How that shape is found."""
+    vd: RegularizerConfig = field(default_factory=RegularizerConfig)
+    """The visible-domain hook; of two sets of Gaussians each has its loss."""
+
+
+@dataclass(frozen=True)
+class GsGoConfig(HullStartConfig):
     """3DGS-GO: the coarse stage of GaussianObject (Yang et al. 2024), without its diffusion repair."""
 
     steps: int = 10_000
@@ -41,11 +57,6 @@ class GsGoConfig(GaussianSetConfig):
     floater_sigmas: tuple[float, float] = (1.0, 2.326)
     """Its threshold in standard deviations, from the first to the last removal."""
 
-    hull: VisibleDomain | None = field(default_factory=lambda: VisibleDomain(kind="released-go"))
-    """Where the Gaussians start; None for the points of structure from motion, where the scene has them."""
-    vd: RegularizerConfig = field(default_factory=RegularizerConfig)
-    """The visible-domain hook."""
-
     def __post_init__(self) -> None:
         super().__post_init__()
         not_negative = ("depth_weight", "prune_large_from", "opacity_reset_every", "floater_every")
@@ -59,7 +70,7 @@ class GsGoConfig(GaussianSetConfig):
 
 
 @dataclass(frozen=True)
-class CorgsConfig(GaussianSetConfig):
+class CorgsConfig(HullStartConfig):
     """CoR-GS (Zhang et al. 2024): two sets of Gaussians that check each other.
 
     Defaults are the authors' for captures all round a scene (their script for mip-NeRF 360), where they say them.
@@ -97,12 +108,6 @@ class CorgsConfig(GaussianSetConfig):
     co_prune_world: float | None = None
     """The same in units of the scene; wins over the fraction. The authors: 20 for mip-NeRF 360, 10 for DTU, 5 for
     LLFF, in the units COLMAP happened to choose."""
-
-    hull: VisibleDomain | None = field(default_factory=lambda: VisibleDomain(kind="released-go"))
-    """Where the Gaussians start, unless that is random; None for the points of structure from motion, where the
-    scene has them."""
-    vd: RegularizerConfig = field(default_factory=RegularizerConfig)
-    """The visible-domain hook, called once for each set."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -21,8 +21,8 @@ def draw_points(
 ) -> tuple[Tensor, Tensor]:
     """Points of the first hook; without one, in the hull; without a hull, those of structure from motion.
 
-    Points in the hull have the views' mean colours. Of structure from motion, `n` points are drawn.
-    Without any, points are drawn in a box around what the cameras look at.
+    Points in the hull, or in `hull.inner` where it has one, have the views' mean colours. Of structure from
+    motion, `n` points are drawn. Without any, points are drawn in a box around what the cameras look at.
 
     Returns:
         xyz (N, 3) float32 world frame and rgb (N, 3) in [0, 1], N at most n.
@@ -30,7 +30,7 @@ def draw_points(
     if hooks:
         return hooks[0].initial_points(n, generator)
     if hull is not None:
-        xyz = hull.sample_inside(n, generator).float()
+        xyz = (hull.inner or hull).sample_inside(n, generator).float()
         return xyz, mean_masked_colour(xyz, views)
     if views.points is not None and len(views.points[0]):
         xyz, rgb = views.points

@@ -11,9 +11,10 @@ from visdom_plugin.atomic_files import finite
 from visdom_plugin.errors import VisDomError
 from visdom_plugin.scene import Scene
 from visdom_plugin.training.hull_run.config import METHOD, HullRunConfig
-from visdom_plugin.training.run import find_versions, write_hull
+from visdom_plugin.training.run import find_versions
 from visdom_plugin.training.runs.config_io import as_plain
 from visdom_plugin.training.runs.run_directory import RunDir, describe_data
+from visdom_plugin.training.runs.saved_hulls import write_hull
 
 log = logging.getLogger(__name__)
 
