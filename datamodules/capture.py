@@ -92,17 +92,6 @@ def sort_frames(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     return tuple(sorted(frames, key=lambda frame: stem(frame.name)))
 
 
-class ViewFiles(NamedTuple):
-    """Where the pixels of one view lie below the scene's root; the fields of `Frame`."""
-
-    name: str
-    image: str
-    mask: str | None
-    ignore: str | None
-    excluded: str | None
-    depth: str | None
-
-
 class LoadedView(NamedTuple):
     """One view at its final size."""
 

@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from datamodules.capture import Capture
-from datamodules.files.paths import inside, read_plain
+from datamodules.files.paths import inside, read_file
 from datamodules.open_scene import Chosen, choose_files
 from datamodules.recognise import opening, read_capture
 from datamodules.request import Request
 from datamodules.views.reader import map_on_cores
-from visdom_plugin.errors import SceneError
 
 
 class Fingerprint(NamedTuple):
@@ -88,13 +87,4 @@ def hash_file(path: Path) -> str:
     Raises:
         SceneError: it cannot be read.
     """
-    try:
-        return hashlib.sha256(read_plain(path)).hexdigest()
-    except FileNotFoundError:
-        return ""
-    except (OSError, ValueError) as error:
-        raise SceneError(
-            f"a file cannot be read: {getattr(error, 'strerror', None) or error}",
-            where=path,
-            todo="make it a plain file that you may read",
-        ) from error
+    return hashlib.sha256(read_file(path)).hexdigest() if path.exists() else ""

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from datamodules.capture import Capture, Frame, LoadedView, Pools, ViewFiles
+from datamodules.capture import Capture, Frame, LoadedView, Pools
 from datamodules.files.colmap_points import read_points
 from datamodules.files.paths import check_name, inside, printable, stem
 from datamodules.hashing import hash_parts
@@ -42,8 +43,8 @@ class Chosen(NamedTuple):
     """Of the photographs."""
     factor: float
     """How much smaller the photographs' files are than the cameras say."""
-    files: list[ViewFiles]
-    """Of the training views, then of the test views."""
+    files: list[Frame]
+    """The training views, then the test views, each file under the name that it has on disk."""
     notes: list[str]
     """How files were found, where that is not plain."""
 
@@ -99,9 +100,23 @@ def open_capture(capture: Capture, request: Request) -> Scene:
     later = LaterViews(lambda i: reader.read(n + i), map_on_cores(reader.inspect, range(n, len(files))))
     sizes = [(v.image.shape[1], v.image.shape[0]) for v in loaded] + [v.size for v in later.inspected]
     cameras = calibration.cameras.resized(*torch.tensor(sizes).reshape(-1, 2).unbind(1))
-    train = _views(cameras[:n], loaded, [names[i] for i in split.train])
+    train = _views(
+        cameras[:n],
+        [names[i] for i in split.train],
+        lambda name: tuple(getattr(v, name) for v in loaded),
+        [v.masked for v in loaded],
+        ignoring=any(v.ignore is not None for v in loaded),
+        deep=any(v.depth is not None for v in loaded),
+    )
     bent = any(d is not None for d in calibration.distortions[n:])
-    test = _later_views(cameras[n:], later, [names[i] for i in split.test], bent=bent)
+    test = _views(
+        cameras[n:],
+        [names[i] for i in split.test],
+        later.field,
+        [v.masked for v in later.inspected],
+        ignoring=bent or any(v.ignoring for v in later.inspected),
+        deep=any(v.deep for v in later.inspected),
+    )
     _warn_inverted(train)
     name = printable(capture.name or capture.root.resolve().name)
     source = {
@@ -140,11 +155,15 @@ def _check_names(capture: Capture, request: Request) -> None:
     ordered = sorted((stem(frame.name), frame.name) for frame in capture.frames)
     for (one, first), (two, second) in pairwise(ordered):
         if one == two:
+            twice = first == second
             raise SceneError(
-                f"two registered images share the name {one}: {first} and {second}",
+                f"two registered images share the name {printable(one)}: "
+                + ("it is listed twice" if twice else f"{printable(first)} and {printable(second)}"),
                 where=capture.root,
-                cause="positions in the index files and masks are found by this name",
-                todo="rename one of them",
+                cause="two models or lists merged into one"
+                if twice
+                else "positions in the index files and masks are found by this name",
+                todo="list each photograph once" if twice else "rename one of them",
             )
 
 
@@ -217,43 +236,41 @@ def _refuse_absent(root: Path, absent: Sequence[str]) -> None:
         )
 
 
-def _files(frame: Frame, image: str, mask: str | None, ignored: str | None, there: ImageFiles) -> ViewFiles:
+def _files(frame: Frame, image: str, mask: str | None, ignored: str | None, there: ImageFiles) -> Frame:
     def found(name: str | None) -> str | None:
         return name and (there.find(name, anywhere=False) or name)
 
     ignore, excluded = found(frame.ignore), found(frame.excluded or ignored)
-    return ViewFiles(frame.name, image, found(mask), ignore, excluded, found(frame.depth))
-
-
-def _views(cameras: Cameras, loaded: Sequence[LoadedView], names: Sequence[str]) -> Views:
-    def optional(values: list[Tensor | None]) -> tuple[Tensor | None, ...]:
-        return tuple(values) if any(v is not None for v in values) else ()
-
-    return Views(
-        cameras=cameras,
-        images=tuple(v.image for v in loaded),
-        masks=tuple(v.mask for v in loaded),
-        names=tuple(names),
-        mono_depths=optional([v.depth for v in loaded]),
-        ignore=optional([v.ignore for v in loaded]),
-        mask_origins=()
-        if all(v.masked for v in loaded)
-        else tuple("given" if v.masked else "missing" for v in loaded),
+    return replace(
+        frame, image=image, mask=found(mask), ignore=ignore, excluded=excluded, depth=found(frame.depth)
     )
 
 
-def _later_views(cameras: Cameras, later: LaterViews, names: Sequence[str], *, bent: bool) -> Views:
-    seen = later.inspected
+def _views(
+    cameras: Cameras,
+    names: Sequence[str],
+    field: Callable[[str], Sequence[Any]],
+    masked: Sequence[bool],
+    *,
+    ignoring: bool,
+    deep: bool,
+) -> Views:
+    """Views from the fields of their `LoadedView`s.
+
+    Args:
+        field: of all views, by its name.
+        masked: which views have a mask.
+        ignoring: whether any may have ignored pixels.
+        deep: whether any has a depth map.
+    """
     return Views(
         cameras=cameras,
-        images=later.field("image"),
-        masks=later.field("mask"),
+        images=field("image"),
+        masks=field("mask"),
         names=tuple(names),
-        mono_depths=later.field("depth") if any(v.deep for v in seen) else (),
-        ignore=later.field("ignore") if bent or any(v.ignoring for v in seen) else (),
-        mask_origins=()
-        if all(v.masked for v in seen)
-        else tuple("given" if v.masked else "missing" for v in seen),
+        mono_depths=field("depth") if deep else (),
+        ignore=field("ignore") if ignoring else (),
+        mask_origins=() if all(masked) else tuple("given" if m else "missing" for m in masked),
     )
 
 

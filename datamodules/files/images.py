@@ -15,7 +15,6 @@ import numpy as np
 from PIL import Image
 from PIL.ImageFile import ImageFile
 
-from datamodules.files.paths import read_plain
 from visdom_plugin.errors import SceneError
 
 MAX_PIXELS = 2**28
@@ -33,26 +32,6 @@ _PLUGINS = {
     "HEIC": ("pillow_heif", "HeifImageFile"),
 }
 _ORIENTATION = 0x0112
-
-
-def read_file(path: Path) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        SceneError: it is missing or cannot be read.
-    """
-    try:
-        return read_plain(path)
-    except FileNotFoundError:
-        raise SceneError(
-            "an image file is missing", where=path, todo="copy it there, or take the view off the index files"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise SceneError(
-            f"an image file cannot be read: {getattr(error, 'strerror', None) or error}",
-            where=path,
-            todo="make it a plain file that you may read",
-        ) from error
 
 
 class Header(NamedTuple):

@@ -9,19 +9,12 @@ import csv
 import io
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
 from visdom_plugin.errors import SceneError
-
-_NPY = b"\x93NUMPY"
-_HEADER = re.compile(
-    r"\s*\{\s*'descr':\s*'([<>|=][fiub]\d{1,2})',\s*'fortran_order':\s*(True|False),"
-    r"\s*'shape':\s*\(([\d\s,]{0,200})\),?\s*\}\s*"
-)
 
 
 def damaged(path: Path, what: str, cause: str = "the file is truncated or damaged") -> NoReturn:
@@ -135,38 +128,30 @@ def csv_number(row: dict[str, str], column: str, path: Path) -> float:
 
 
 def parse_npy(data: bytes, path: Path) -> np.ndarray:
-    """A numeric array in NumPy's .npy format (versions 1 to 3); the header is never evaluated.
+    """A numeric array in NumPy's .npy format; nothing is allocated before its size is compared with the bytes.
 
     Raises:
         SceneError: another format or type, or fewer or more bytes than the shape asks for.
     """
-    if not data.startswith(_NPY) or len(data) < 12 or data[6] not in (1, 2, 3):
-        damaged(
-            path, f"{path.name} is not a NumPy array", cause="a damaged file, or another file of this name"
-        )
-    width = 2 if data[6] == 1 else 4
-    begin = 8 + width
-    end = begin + int.from_bytes(data[8:begin], "little")
-    header = (
-        _HEADER.fullmatch(data[begin : min(end, begin + 4096)].decode("latin-1"))
-        if end <= len(data)
-        else None
-    )
-    if header is None:
-        damaged(path, f"{path.name} has no header of a numeric array")
-    kind, fortran, dimensions = header.groups()
+    stream = io.BytesIO(data)
     try:
-        dtype = np.dtype(kind)
-        shape = tuple(int(n) for n in dimensions.split(",") if n.strip())
-    except (TypeError, ValueError):
-        damaged(path, f"{path.name} has no header of a numeric array")
-    if len(shape) > 8 or math.prod(shape) * dtype.itemsize != len(data) - end:
+        version = np.lib.format.read_magic(stream)
+        read = (
+            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        )
+        shape, fortran, dtype = read(stream)
+    except Exception as error:  # NumPy raises whatever its parser of literals does
         damaged(
             path,
-            f"{path.name} declares an array of {dimensions} x {dtype.itemsize} bytes and holds {len(data) - end}",
+            f"{path.name} is not a NumPy array: {str(error)[:100]}",
+            cause="a damaged file, or another file of this name",
         )
-    array = np.frombuffer(data, dtype, offset=end)
-    return array.reshape(shape, order="F" if fortran == "True" else "C")
+    if dtype.kind not in "fiub" or len(shape) > 8 or any(n < 0 for n in shape):
+        damaged(path, f"{path.name} holds no numeric array", cause="another file of this name")
+    end = stream.tell()
+    if math.prod(shape) * dtype.itemsize != len(data) - end:
+        damaged(path, f"{path.name} declares an array of {shape} {dtype} and holds {len(data) - end} bytes")
+    return np.frombuffer(data, dtype, offset=end).reshape(shape, order="F" if fortran else "C")
 
 
 def _shown(value: Any) -> str:

@@ -93,23 +93,36 @@ def read_plain(path: Path, most: int = MOST_BYTES) -> bytes:
         os.close(handle)
 
 
+def read_file(path: Path, most: int = MOST_BYTES) -> bytes:
+    """The bytes of a plain file.
+
+    Raises:
+        SceneError: it is missing, cannot be read or is too large.
+    """
+    try:
+        return read_plain(path, most)
+    except FileNotFoundError:
+        raise SceneError(
+            f"there is no file {printable(path.name)}",
+            where=path,
+            cause="the scene was copied only in part",
+            todo="copy it there",
+        ) from None
+    except (OSError, ValueError) as error:
+        raise SceneError(
+            f"{printable(path.name)} cannot be read: {getattr(error, 'strerror', None) or error}",
+            where=path,
+            todo="make it a plain file that you may read",
+        ) from error
+
+
 def read_inside(root: Path, relative: str, *, outside: bool = False, most: int = MOST_BYTES) -> bytes:
     """The bytes of a file below `root`.
 
     Raises:
         SceneError: it leads outside, is missing, cannot be read or is too large.
     """
-    path = inside(root, relative, outside=outside)
-    try:
-        return read_plain(path, most)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise SceneError(
-            f"{PurePosixPath(relative).name} cannot be read: {reason}",
-            where=path,
-            cause="the scene was copied only in part" if isinstance(error, FileNotFoundError) else None,
-            todo="make it a plain file that you may read",
-        ) from error
+    return read_file(inside(root, relative, outside=outside), most)
 
 
 def stem(name: str) -> str:

@@ -11,7 +11,6 @@ or lists say otherwise.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 from datamodules.capture import Calibration, Capture, Frame, sort_frames
@@ -72,19 +71,10 @@ def read_capture(
     for image in model.images:
         check_name(image.name, model.folder, outside=request.allow_outside)
     registered = {image.name: image for image in model.images}
-    if len(registered) < len(model.images):
-        names = sorted(image.name for image in model.images)
-        twice = next(a for a, b in pairwise(names) if a == b)
-        raise SceneError(
-            f"two registered images share the name {stem(twice)}: {twice} is listed twice",
-            where=model.folder,
-            cause="two models merged into one, or a damaged file",
-            todo="export the model again",
-        )
     frames = sort_frames(
         [
             Frame(name, f"images/{name}", depth=None if depths is None else f"{depths}/{stem(name)}.png")
-            for name in registered
+            for name in (image.name for image in model.images)
         ]
     )
 

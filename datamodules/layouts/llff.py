@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from datamodules.capture import Calibration, Capture, Frame, sort_frames
+from datamodules.files.images import ENDINGS
 from datamodules.files.parsers import damaged, parse_npy
 from datamodules.files.paths import check_name, inside, read_inside
 from datamodules.files.pinholes import pinholes
@@ -24,7 +25,6 @@ from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras
 
 FILE = "poses_bounds.npy"
-_PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
 
 
 def recognise(root: Path) -> str | None:
@@ -114,7 +114,7 @@ def _list_photographs(root: Path, request: Request) -> list[str]:
     for name in folders:
         folder = inside(root, name, outside=request.allow_outside)
         if folder.is_dir():
-            found = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _PHOTOGRAPHS)
+            found = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in ENDINGS)
             for file in found:
                 check_name(file, folder)
             return found

@@ -22,14 +22,14 @@ from typing import Any
 from datamodules.capture import Calibration, Capture, Frame, Pools, sort_frames
 from datamodules.files import images
 from datamodules.files.parsers import damaged, matrix, number, parse_json, size, text
-from datamodules.files.paths import check_name, inside, printable, read_inside
+from datamodules.files.paths import check_name, inside, printable, read_file, read_inside
 from datamodules.files.pinholes import pinholes
 from datamodules.files.undistort import Distortion
 from datamodules.request import Request
 from datamodules.views import splits
+from datamodules.views.find_files import ImageFiles
 from visdom_plugin.errors import SceneError
 
-_PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
 _LENS = ("x_fov", "y_fov", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy")
 _BENT = ("k1", "k2", "k3", "k4", "p1", "p2")
 
@@ -193,13 +193,11 @@ def make_capture(
         rename: from a file_path to the photograph's path below the root, for layouts that have a rule.
     """
     of_name: dict[str, tuple[Transforms, Entry, int]] = {}
-    frames = []
+    frames, there = [], ImageFiles(root)
     for part, file in enumerate(files):
         for entry in file.entries:
-            name = (rename or (lambda p: _find_photograph(root, p, request)))(entry.file_path)
-            check_name(name, file.path, outside=request.allow_outside)
-            if name in of_name:
-                damaged(file.path, f"{printable(name)} is listed twice", cause="two captures merged into one")
+            check_name(entry.file_path, file.path, outside=request.allow_outside or rename is not None)
+            name = rename(entry.file_path) if rename else _find_photograph(there, entry.file_path)
             of_name[name] = file, entry, part
             frames.append(_frame(root, name, entry, request))
     ordered = sort_frames(frames)
@@ -210,7 +208,7 @@ def make_capture(
     pointed = any(entry.mask_path for file in files for entry in file.entries)
 
     def calibrate(wanted: Sequence[int]) -> Calibration:
-        lenses = [_lens(root, ordered[i], *of_name[ordered[i].name][:2], request) for i in wanted]
+        lenses = [_lens(there, ordered[i], *of_name[ordered[i].name][:2], request) for i in wanted]
         entries = [of_name[ordered[i].name][1] for i in wanted]
         cameras = pinholes(
             [K for K, _ in lenses],
@@ -235,14 +233,11 @@ def make_capture(
     )
 
 
-def _find_photograph(root: Path, file_path: str, request: Request) -> str:
+def _find_photograph(there: ImageFiles, file_path: str) -> str:
     """The photograph's path below the root: extensions may be left out."""
-    if PurePosixPath(file_path).suffix.lower() in _PHOTOGRAPHS:
+    if PurePosixPath(file_path).suffix.lower() in images.ENDINGS:
         return file_path
-    check_name(file_path, root, outside=request.allow_outside)
-    ends = (*_PHOTOGRAPHS, *(end.upper() for end in _PHOTOGRAPHS))
-    found = [file_path + end for end in ends if (root / (file_path + end)).exists()]
-    return found[0] if found else file_path + ".png"
+    return there.find(f"{file_path}.png", anywhere=False) or f"{file_path}.png"
 
 
 def _frame(root: Path, name: str, entry: Entry, request: Request) -> Frame:
@@ -279,13 +274,13 @@ def _pools(frames: Sequence[Frame], of_name: dict, files: Sequence[Transforms]) 
 
 
 def _lens(
-    root: Path, frame: Frame, file: Transforms, entry: Entry, request: Request
+    there: ImageFiles, frame: Frame, file: Transforms, entry: Entry, request: Request
 ) -> tuple[tuple[float, float, float, float], tuple[int, int]]:
     """(fx, fy, cx, cy) in pixels and (width, height); the size is the photograph's where none is given."""
     dimensions = entry.size
     if dimensions is None:
-        path = inside(root, frame.image, outside=request.allow_outside)
-        dimensions = images.read_header(images.read_file(path), path).size
+        path = inside(there.root, there.find(frame.image) or frame.image, outside=request.allow_outside)
+        dimensions = images.read_header(read_file(path), path).size
     both = {**file.shared, **entry.own}
     focal = _focal(entry.own, dimensions) or _focal(file.shared, dimensions)
     if focal is None:

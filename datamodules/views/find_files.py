@@ -35,19 +35,19 @@ class ImageFiles:
     """The image files below a folder, which is walked when the first name is not there as it is written."""
 
     def __init__(self, root: Path):
-        self._root = root
+        self.root = root
 
     @cached_property
     def _by_key(self) -> dict[str, list[str]]:
         found, count = defaultdict(list), 0
-        for folder, folders, files in os.walk(self._root):
+        for folder, folders, files in os.walk(self.root):
             folders[:] = sorted(name for name in folders if not name.startswith("."))
             count += len(files)
             if count > _MOST_FILES:
                 break
             for file in files:
                 if file.lower().endswith(ENDINGS):
-                    found[loose_key(file)].append(Path(folder, file).relative_to(self._root).as_posix())
+                    found[loose_key(file)].append(Path(folder, file).relative_to(self.root).as_posix())
         return found
 
     def find(self, name: str, *, anywhere: bool = True) -> str | None:
@@ -60,7 +60,7 @@ class ImageFiles:
         Args:
             anywhere: False looks in the folder alone that the name gives.
         """
-        if (self._root / name).exists():
+        if (self.root / name).exists():
             return name
         wanted = _folders(name)
         shared = defaultdict(list)

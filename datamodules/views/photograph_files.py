@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from datamodules.capture import ViewFiles
+from datamodules.capture import Frame
 from datamodules.files import images, masks
-from datamodules.files.paths import inside
+from datamodules.files.paths import inside, read_file
 from datamodules.request import Request
 from visdom_plugin.errors import SceneError
 
@@ -56,7 +56,7 @@ class Photograph(NamedTuple):
         return images.turn(pixels, self.orientation) if self.turned else pixels
 
 
-def open_photograph(reading: Reading, file: ViewFiles, full: tuple[int, int]) -> Photograph:
+def open_photograph(reading: Reading, file: Frame, full: tuple[int, int]) -> Photograph:
     """Reads a photograph's header.
 
     Args:
@@ -66,7 +66,7 @@ def open_photograph(reading: Reading, file: ViewFiles, full: tuple[int, int]) ->
         SceneError: the file is missing or damaged, or its size is not its camera's.
     """
     path = reading.find(file.image)
-    data = images.read_file(path)
+    data = read_file(path)
     size, alpha, orientation = images.read_header(data, path)
     upright = size[::-1] if orientation >= 5 else size
     turned = not _fits_camera(size, full, reading.factor) and _fits_camera(upright, full, reading.factor)

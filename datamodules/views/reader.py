@@ -13,9 +13,9 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from datamodules.capture import Calibration, Capture, InspectedView, LoadedView, ViewFiles
+from datamodules.capture import Calibration, Capture, Frame, InspectedView, LoadedView
 from datamodules.files import images, masks
-from datamodules.files.paths import printable
+from datamodules.files.paths import printable, read_file
 from datamodules.files.undistort import undistort
 from datamodules.request import Request
 from datamodules.views import orientation, side_files
@@ -34,7 +34,7 @@ class ViewReader:
 
     def __init__(
         self,
-        files: Sequence[ViewFiles],
+        files: Sequence[Frame],
         calibration: Calibration,
         factor: float,
         downscale: float,
@@ -117,7 +117,7 @@ class ViewReader:
             state.update(b"turned by its tag where sizes or outlines ask for it")
         for relative in (file.mask, file.ignore, file.excluded, file.depth):
             if relative is not None and (other := reading.find(relative)).is_file():
-                state.update(hashlib.sha256(images.read_file(other)).digest())
+                state.update(hashlib.sha256(read_file(other)).digest())
         missing_allowed = reading.request.allow_missing_masks
         masked = photo.alpha and reading.request.mask_source != "folder"
         if file.mask is not None or (masked and missing_allowed):

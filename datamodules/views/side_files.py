@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datamodules.capture import ViewFiles
+from datamodules.capture import Frame
 from datamodules.files import images, masks
+from datamodules.files.paths import read_file
 from datamodules.views import orientation
 from datamodules.views.photograph_files import Photograph, Reading
 from visdom_plugin.errors import SceneError
@@ -21,7 +22,7 @@ ChooseTurns = Callable[[], tuple[int, bool]]
 
 
 def read_mask(
-    reading: Reading, file: ViewFiles, photo: Photograph, choose_turns: ChooseTurns
+    reading: Reading, file: Frame, photo: Photograph, choose_turns: ChooseTurns
 ) -> tuple[np.ndarray | None, Path, tuple[str, ...]]:
     """(H, W) float32 opacity at the file's own size, the file, and remarks; None where there is no mask."""
     source, alpha = reading.request.mask_source, None
@@ -39,7 +40,7 @@ def read_mask(
 
 
 def read_ignored(
-    reading: Reading, file: ViewFiles, photo: Photograph, choose_turns: ChooseTurns
+    reading: Reading, file: Frame, photo: Photograph, choose_turns: ChooseTurns
 ) -> np.ndarray | None:
     """(H, W) bool at the photograph's size, True where nothing is known; None where everything is."""
     ignore = None
@@ -53,7 +54,7 @@ def read_ignored(
 
 
 def read_depth(
-    reading: Reading, file: ViewFiles, full: tuple[int, int], target: tuple[int, int]
+    reading: Reading, file: Frame, full: tuple[int, int], target: tuple[int, int]
 ) -> Tensor | None:
     """(H, W) float32 monocular depth at the target's size; None where the view has none.
 
@@ -67,7 +68,7 @@ def read_depth(
     path = None if file.depth is None else reading.find(file.depth)
     if path is None or not path.is_file():
         return None
-    data = images.read_file(path)
+    data = read_file(path)
     size = images.read_header(data, path).size
     if abs(size[0] * full[1] - size[1] * full[0]) > max(full):
         raise SceneError(
@@ -85,7 +86,7 @@ def resize(soft: np.ndarray, width: int, height: int) -> np.ndarray:
     return images.shrink_nearest(soft, width, height)
 
 
-def refuse_unmasked(reading: Reading, file: ViewFiles, path: Path) -> None:
+def refuse_unmasked(reading: Reading, file: Frame, path: Path) -> None:
     """Raises SceneError about a view that has no mask, with what there is in its place."""
     if file.ignore is not None:
         raise SceneError(
@@ -125,7 +126,7 @@ def open_side_file(reading: Reading, relative: str, photo: Photograph, what: str
         SceneError: it is missing or damaged, or has another shape than its photograph.
     """
     path = reading.find(relative)
-    data = images.read_file(path)
+    data = read_file(path)
     header = images.read_header(data, path)
     ways = orientation.possible_turns(photo.orientation, photo.turned, header.orientation)
     ways = [turns for turns in ways if masks.fits(orientation.turned_size(header.size, turns), photo.size)]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from PIL import Image
 
 from datamodules import load
 from datamodules.synthetic.config import SyntheticConfig
@@ -95,3 +96,23 @@ def test_masks_in_a_folder_of_another_name(views, tmp_path, other, form):
     assert all(
         map(torch.equal, load(folder, views=6, data_format="colmap", masks=other).train.masks, expected)
     )
+
+
+@pytest.mark.parametrize("writer", [w.write_colmap, w.write_nerfstudio])
+def test_a_photograph_listed_twice_is_named(writer, views, tmp_path):
+    folder = writer(w.join(views, views.take([2])), tmp_path / "s")
+    with pytest.raises(SceneError, match=f"{views.names[2]}: it is listed twice"):
+        load(folder, views=3)
+
+
+@pytest.mark.parametrize("ending", [".jpg", ".JPG", ".webp"])
+def test_blenders_names_without_ending_and_sizes_are_found(ending, views, tmp_path):
+    parts = {"train": views.take(range(6)), "test": views.take([6, 7])}
+    folder = w.write_blender(parts, tmp_path / "s")
+    for part in parts:
+        for path in (folder / part).iterdir():
+            with Image.open(path) as image:
+                image.convert("RGB").save(path.with_suffix(ending))
+            path.unlink()
+    scene = load(folder, views=4, allow_missing_masks=True)
+    assert scene.train.names[0].endswith(ending) and scene.train.cameras.width.tolist() == [32] * 4
