@@ -74,6 +74,8 @@ def train(
     """
     preset = registry.find(preset_name)
     device = torch.device(device)
+    if preset.hook == "gaussian" and config.hull is None:
+        scene = replace(scene, train=replace(scene.train, points=scene.points))
     identity = {
         "method": preset.name,
         "scene": scene.name,
@@ -118,10 +120,7 @@ def _run(
     checkpoint_seconds: float,
 ) -> int | None:
     saved = run.path / "hull"
-    views = scene.train
-    if preset.hook == "gaussian" and config.hull is None:
-        views = replace(views, points=scene.points)
-    method, hull, hull_s = build(preset, config, views, device=device, seed=seed, saved=saved)
+    method, hull, hull_s = build(preset, config, scene.train, device=device, seed=seed, saved=saved)
     if hull is not None:
         write_hull(hull, saved)
         # Of the run that carved it, not of one that goes on with it.

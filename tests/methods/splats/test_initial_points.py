@@ -8,6 +8,7 @@ import torch
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
 from method_configs import corgs_lite, gs_go
+from visdom_plugin.errors import CheckpointError
 from visdom_plugin.geometry.cameras import look_at_point
 from visdom_plugin.methods.splats.corgs_lite import CorgsLite
 from visdom_plugin.methods.splats.gs_go import GsGo
@@ -73,3 +74,20 @@ def test_a_run_reads_the_scenes_points_only_where_no_hull_is_asked_for(scene, tm
         one = replace(tiny)
         train("3dgs-go", config, one, data_manager=DataManager, run_dir=tmp_path / str(i), quiet=True)
         assert len(asked) == count
+
+
+def test_a_run_from_other_points_is_another_run(scene, tmp_path, monkeypatch):
+    small = replace(gs_go.SPEC.quick, steps=1, initial_points=50, hull=None)
+    preset = Preset("3dgs-go", "", "visdom_plugin.methods.splats.gs_go:GsGo", small, small)
+    monkeypatch.setattr("visdom_plugin.registry.find", lambda name: preset)
+
+    def run(xyz, rgb):
+        tiny = replace(scene, test=scene.test.take([0]), read_points=lambda: (xyz, rgb))
+        return train("3dgs-go", small, tiny, data_manager=DataManager, run_dir=tmp_path / "run", quiet=True)
+
+    xyz, rgb = cloud(scene.train)
+    assert not run(xyz, rgb)["already_finished"]
+    assert run(xyz.clone(), rgb.clone())["already_finished"]
+    for others in ((xyz + 0.01, rgb), (xyz, 1 - rgb), (xyz[1:], rgb[1:])):
+        with pytest.raises(CheckpointError, match="another run"):
+            run(*others)

@@ -38,7 +38,8 @@ _LOCK = "run.lock"
 
 
 def hash_views(views: Views) -> str:
-    """SHA-256 of everything training can see of the views: pixels, masks, depths, cameras and names.
+    """SHA-256 of everything training can see of the views: pixels, masks, depths, cameras, names, and the points
+    that it is to start from.
 
     Of views that are decoded on first use, their files are hashed in place of their pixels.
     """
@@ -52,6 +53,8 @@ def hash_views(views: Views) -> str:
 
     cameras = views.cameras
     add(cameras.intrinsics.double(), cameras.world_from_camera.double(), cameras.width, cameras.height)
+    if views.points is not None:
+        add(*views.points)
     later = getattr(views.images, "fingerprint", None)
     if later is not None:
         digest.update(f"{later} {list(views.names)} {list(views.mask_origins)}".encode())
