@@ -1,11 +1,15 @@
-"""Settings of the hooks. Free of heavy imports, so that command lines can show them at once."""
+"""A method's part of the hooks: their settings with a switch, and the config fields that go with them.
+
+Hooks are made here of settings, and imported only then, so that command lines can show the settings at once.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.hooks.settings import RegularizerSettings, SamplerSettings
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.validation import demand
 
@@ -17,26 +21,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class SamplerConfig:
+class SamplerConfig(SamplerSettings):
     """Settings of VisDomSampler: a band around the hull outside which no samples are taken."""
 
     enabled: bool = False
     """Whether the hook takes part at all; off leaves the base method unchanged."""
-    epsilon_camera_distances: float = 0.03
-    """Half width of the band, in mean distances from the training cameras to the hull's centre (the paper's 0.2
-    for cameras at distance 1)."""
-    epsilon_hull_radii: float | None = None
-    """The same in radii of the hull, in place of camera distances."""
-    epsilon_world: float | None = None
-    """The same in units of the scene; give one of these two."""
-    interval: Literal["first_hit", "entry_exit"] = "entry_exit"
-    """Around the first hit, as the paper writes, or from before the first to behind the last."""
-    missing: Literal["full", "skip"] = "full"
-    """Rays that miss the hull: sampled over the method's full range, or not at all."""
-    hull_at_inference: bool = False
-    """Novel views, too, are sampled inside the band only, and rays that miss show the background."""
-    drop_outside: bool = False
-    """Of the samples in the band, those at points outside the hull count nothing (VaxNeRF; Instant-NGP only)."""
 
     def build(self, hull: Hull, views: Views) -> VisDomSampler:
         """The hook for one hull, and the training views whose mean distance is the unit."""
@@ -46,28 +35,11 @@ class SamplerConfig:
 
 
 @dataclass(frozen=True)
-class RegularizerConfig:
+class RegularizerConfig(RegularizerSettings):
     """Settings of VisDomGaussianRegularizer: points to start from, and the loss L_i on views between cameras."""
 
     enabled: bool = False
     """Whether the hook takes part at all; off leaves the base method unchanged."""
-    weight: float = 0.01
-    """lambda_3, the weight of L_i (the paper's value)."""
-    every: int = 1
-    """Add L_i on every n-th step."""
-    start: int = 0
-    """First step with L_i."""
-    views_per_step: int = 1
-    """Interpolated views per loss."""
-    bank: int = 64
-    """Views to draw from, made once, so that the hull's silhouette is cast once for each; 0 draws a new view
-    every time."""
-    points: Literal["surface", "volume"] = "volume"
-    """Where initial points lie: on the hull's surface, or anywhere inside it, where the object is."""
-    prune_every: int = 50
-    """Remove Gaussians whose centres lie outside the hull on every n-th step; 0 leaves them to L_i."""
-    prune_margin_voxels: float = 2.0
-    """How far outside the hull a centre may lie before it is removed, in voxels of the hull's grid."""
 
     def build(self, hull: Hull, views: Views) -> VisDomGaussianRegularizer:
         """The hook for one hull and the training views whose colours the initial points take."""

@@ -16,7 +16,7 @@ from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.camera_paths import interpolate
 from visdom_plugin.geometry.cameras import Cameras, project, require_batch
 from visdom_plugin.geometry.local_frame import is_near
-from visdom_plugin.hooks.configs import RegularizerConfig
+from visdom_plugin.hooks.settings import RegularizerSettings
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.point_colours import check_images, colour_points
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
@@ -112,8 +112,7 @@ class VisDomGaussianRegularizer:
         hull: the visible domain; fixed from here on.
         cameras: (N,) training cameras, N >= 2; their interpolation gives the views of L_i. The bank of views is
             the same for every hook with the same hull and cameras, so that runs can resume.
-        config: its settings, RegularizerConfig's own by default. Whether it is `enabled` is a method's to read:
-            the hook itself is on.
+        config: its settings, RegularizerSettings's own by default.
         images: N tensors or arrays (H, W, 3) of the cameras' sizes, integers in 0..255 or floats in [0, 1], that
             colour the initial points; grey without.
         settings: single fields of the config to change: `VisDomGaussianRegularizer(hull, cameras, weight=0.1)`.
@@ -127,7 +126,7 @@ class VisDomGaussianRegularizer:
         self,
         hull: Hull,
         cameras: Cameras,
-        config: RegularizerConfig | None = None,
+        config: RegularizerSettings | None = None,
         *,
         images: Sequence[Tensor | np.ndarray] | None = None,
         **settings: Any,
@@ -138,7 +137,7 @@ class VisDomGaussianRegularizer:
                 "VisDomGaussianRegularizer needs at least two training cameras to interpolate between",
                 todo="pass the batch of all training cameras",
             )
-        self.config = c = replace(config or RegularizerConfig(), **settings)
+        self.config = c = replace(config or RegularizerSettings(), **settings)
         if not (
             0 <= c.weight < math.inf
             and c.every >= 1

@@ -11,8 +11,8 @@ from torch import Tensor
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import Cameras, rays_of_pixels
 from visdom_plugin.hooks import torch_ops
-from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import RayBounds
+from visdom_plugin.hooks.settings import SamplerSettings
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.raycast import Crossing, cast
 
@@ -36,7 +36,7 @@ def _limit(value: Tensor | float, like: Tensor) -> Tensor:
         ) from error
 
 
-def _epsilon_world(config: SamplerConfig, hull: Hull, cameras: Cameras | None) -> float:
+def _epsilon_world(config: SamplerSettings, hull: Hull, cameras: Cameras | None) -> float:
     """Half width of the band in scene units."""
     if config.epsilon_hull_radii is not None and config.epsilon_world is not None:
         raise ConfigError(
@@ -98,8 +98,7 @@ class VisDomSampler:
 
     Args:
         hull: the visible domain; fixed from here on.
-        config: its settings, SamplerConfig's own by default. Whether it is `enabled`, and where, is a method's to
-            read: the hook itself is on.
+        config: its settings, SamplerSettings's own by default.
         cameras: (N,) training cameras, whose mean distance from the hull's centre is the unit of
             `epsilon_camera_distances`; without them it is 10/3 radii of the hull.
         settings: single fields of the config to change: `VisDomSampler(hull, missing="skip")`.
@@ -111,13 +110,13 @@ class VisDomSampler:
     def __init__(
         self,
         hull: Hull,
-        config: SamplerConfig | None = None,
+        config: SamplerSettings | None = None,
         *,
         cameras: Cameras | None = None,
         **settings: Any,
     ):
         self.hull = hull
-        self.config = config = replace(config or SamplerConfig(), **settings)
+        self.config = config = replace(config or SamplerSettings(), **settings)
         if config.interval not in ("first_hit", "entry_exit") or config.missing not in ("full", "skip"):
             raise ConfigError(
                 f"interval={config.interval!r}, missing={config.missing!r}: interval must be 'first_hit' or "

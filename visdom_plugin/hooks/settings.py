@@ -1,0 +1,50 @@
+"""Settings of the hooks as plain data; free of heavy imports, so that command lines can show them at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class SamplerSettings:
+    """A band around the hull outside which VisDomSampler allows no samples."""
+
+    epsilon_camera_distances: float = 0.03
+    """Half width of the band, in mean distances from the training cameras to the hull's centre (the paper's 0.2
+    for cameras at distance 1)."""
+    epsilon_hull_radii: float | None = None
+    """The same in radii of the hull, in place of camera distances."""
+    epsilon_world: float | None = None
+    """The same in units of the scene; give one of these two."""
+    interval: Literal["first_hit", "entry_exit"] = "entry_exit"
+    """Around the first hit, as the paper writes, or from before the first to behind the last."""
+    missing: Literal["full", "skip"] = "full"
+    """Rays that miss the hull: sampled over the method's full range, or not at all."""
+    hull_at_inference: bool = False
+    """Novel views, too, are sampled inside the band only, and rays that miss show the background."""
+    drop_outside: bool = False
+    """Of the samples in the band, those at points outside the hull count nothing (VaxNeRF; Instant-NGP only)."""
+
+
+@dataclass(frozen=True)
+class RegularizerSettings:
+    """Points to start from, and the loss L_i on views between cameras, of VisDomGaussianRegularizer."""
+
+    weight: float = 0.01
+    """lambda_3, the weight of L_i (the paper's value)."""
+    every: int = 1
+    """Add L_i on every n-th step."""
+    start: int = 0
+    """First step with L_i."""
+    views_per_step: int = 1
+    """Interpolated views per loss."""
+    bank: int = 64
+    """Views to draw from, made once, so that the hull's silhouette is cast once for each; 0 draws a new view
+    every time."""
+    points: Literal["surface", "volume"] = "volume"
+    """Where initial points lie: on the hull's surface, or anywhere inside it, where the object is."""
+    prune_every: int = 50
+    """Remove Gaussians whose centres lie outside the hull on every n-th step; 0 leaves them to L_i."""
+    prune_margin_voxels: float = 2.0
+    """How far outside the hull a centre may lie before it is removed, in voxels of the hull's grid."""
