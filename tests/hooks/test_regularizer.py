@@ -14,6 +14,7 @@ from visdom_plugin.geometry.cameras import project, rays_of
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hooks.regularizer import outside_loss
+from visdom_plugin.hooks.settings import RegularizerSettings
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.rasterise import rasterise
@@ -192,7 +193,7 @@ def test_all_gaussians_outside_the_hull_are_told_of_once(ball, caplog):
 def test_there_is_one_set_of_defaults(ball):
     cameras, hull = ball
     hook = VisDomGaussianRegularizer(hull, cameras)
-    assert hook.config == RegularizerConfig()
+    assert hook.config == RegularizerSettings()
     means = CENTRE[None].float() + 100
     marked = [hook.after_step(SimpleNamespace(means=means), step) is not None for step in range(101)]
     assert [step for step, due in enumerate(marked) if due] == [0, 50, 100]

@@ -11,6 +11,7 @@ from visdom_plugin import Hull, VisDomSampler
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import SampleFilter, SamplerHook, sample_filters
+from visdom_plugin.hooks.settings import SamplerSettings
 from visdom_plugin.hull.queries.raycast import cast
 from visdom_plugin.scene import Views
 
@@ -153,7 +154,7 @@ def test_there_is_one_set_of_defaults(hull):
     views = Views(cameras, [None] * 5, [None] * 5, list("abcde"))
     built, direct = SamplerConfig(enabled=True).build(hull, views), VisDomSampler(hull, cameras=cameras)
     assert direct.epsilon_world == built.epsilon_world
-    assert direct.config == SamplerConfig() == VisDomSampler(hull).config
+    assert direct.config == SamplerSettings() == VisDomSampler(hull).config
     assert VisDomSampler(hull).epsilon_world == pytest.approx(0.1 * hull.radius)
     given = VisDomSampler(hull, SamplerConfig(missing="skip"), interval="first_hit", cameras=cameras)
     assert given.config == SamplerConfig(missing="skip", interval="first_hit")

@@ -15,7 +15,7 @@ import torch
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hull.carving.culling import explaining_pieces
 from visdom_plugin.hull.carving.keep_rule import KeepRule
-from visdom_plugin.hull.carving.octree import KEPT, MIXED, Areas, classify_cells, keep_centres, sum_areas
+from visdom_plugin.hull.carving.octree import KEPT, MIXED, Areas, classify_cells, keep_centres
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes
 from visdom_plugin.hull.grid.components import find_pieces, piece_of
 
@@ -50,29 +50,28 @@ class Region(NamedTuple):
     """False when the region reaches the limit of the search: the views leave it open."""
 
 
-def find_region(
-    cameras: Cameras,
-    silhouettes: Silhouettes,
-    rule: KeepRule,
-    components: str = "all",
-    drop_below: float = 0.0,
-    *,
-    areas: Areas | None = None,
-    effort: float = 1.0,
-) -> Region | None:
+class Search(NamedTuple):
+    """What a region is searched for."""
+
+    silhouettes: Silhouettes
+    areas: Areas
+    """From `octree.sum_areas`."""
+    rule: KeepRule
+    components: str = "all"
+    """Which pieces the box must hold: "all"; with "explain" those that explain foreground of their own; with any
+    other policy those of not clearly less than `drop_below` of the largest's volume."""
+    drop_below: float = 0.0
+    effort: float = 1.0
+    """Share of the usual number of cells at which the search gives up."""
+
+
+def find_region(cameras: Cameras, search: Search) -> Region | None:
     """The smallest box known to hold the rule's region, or None when no point can satisfy the rule.
 
     The first cube reaches twice as far from the look-at point as the farthest camera. The cube is doubled up to
     three times while it holds nothing, and up to twice while the region touches its faces; a region that still
     touches is open, and is clipped to the first cube that holds any of it.
-
-    Args:
-        components: which pieces the box must hold: "all"; with "explain" those that explain foreground of their
-            own; with any other policy those of not clearly less than `drop_below` of the largest's volume.
-        areas: from `octree.sum_areas`.
-        effort: share of the usual number of cells at which the search gives up.
     """
-    areas = sum_areas(silhouettes) if areas is None else areas
     centre = look_at_point(cameras.to("cpu", dtype=torch.float64)).numpy()
     reach = float((cameras.centres.double().cpu() - torch.from_numpy(centre)).norm(dim=-1).max())
     reach = max(reach, 1e-6)
@@ -80,7 +79,7 @@ def find_region(
     for doubling in range(_DOUBLINGS + 1):
         half = 2.0 * reach * 2**doubling
         start = Grid(centre - half, 2 * half / _START, (_START,) * 3)
-        found = _refine(silhouettes, areas, rule, start, components, drop_below, effort)
+        found = _refine(search, start)
         if found is None:
             continue
         box, touches = found
@@ -93,16 +92,9 @@ def find_region(
     return None if first is None else Region(first, False)
 
 
-def _refine(
-    silhouettes: Silhouettes,
-    areas: Areas,
-    rule: KeepRule,
-    grid: Grid,
-    components: str,
-    drop_below: float,
-    effort: float,
-) -> tuple[np.ndarray, bool] | None:
+def _refine(search: Search, grid: Grid) -> tuple[np.ndarray, bool] | None:
     """Box of the region inside one cube and whether it touches the cube's faces, or None."""
+    silhouettes, areas, rule = search[:3]
     cells = np.stack(np.unravel_index(np.arange(np.prod(grid.shape)), grid.shape), -1)
     settled = np.zeros((0, 3), np.int64)
     while True:
@@ -112,11 +104,11 @@ def _refine(
         inside = np.ones(len(cells), bool)
         whole = len(cells) - len(mixed)
         inside[whole:] = keep_centres(silhouettes, grid, rule, mixed)
-        if components != "all" and inside.sum() >= _ENOUGH:
-            stays = _staying(silhouettes, areas, rule, grid, cells, inside, components, drop_below)
+        if search.components != "all" and inside.sum() >= _ENOUGH:
+            stays = _staying(search, grid, cells, inside)
             whole = int(stays[:whole].sum())
             cells, inside = cells[stays], inside[stays]
-        most = effort * (_MOST_CELLS if inside.any() else _MOST_EMPTY)
+        most = search.effort * (_MOST_CELLS if inside.any() else _MOST_EMPTY)
         last = grid.shape[0] >= _MOST_SIDE or 8 * (len(cells) - whole) > most
         # Corners of several frusta stay undecided in cells of any size.
         if len(cells) == 0 or (last and not inside.any()):
@@ -147,16 +139,7 @@ def _split(cells: np.ndarray) -> np.ndarray:
     return (2 * cells[:, None] + corners).reshape(-1, 3)
 
 
-def _staying(
-    silhouettes: Silhouettes,
-    areas: Areas,
-    rule: KeepRule,
-    grid: Grid,
-    cells: np.ndarray,
-    inside: np.ndarray,
-    components: str,
-    drop_below: float,
-) -> np.ndarray:
+def _staying(search: Search, grid: Grid, cells: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """(M,) bool: the cells of pieces that the box must hold.
 
     Pieces are joined through every cell that may hold a part of the region, however thin; their volumes are
@@ -176,11 +159,13 @@ def _staying(
     occupancy[tuple(where.T)] = True
     pieces = find_pieces(occupancy)
     labels = piece_of(where, occupancy.shape, pieces)
-    if components == "explain":
+    if search.components == "explain":
         coarse = Grid(grid.lower + low * grid.voxel, grid.voxel * 2**shift, occupancy.shape)
-        return explaining_pieces(pieces, occupancy, coarse, silhouettes, rule, areas)[labels]
+        return explaining_pieces(pieces, occupancy, coarse, search.silhouettes, search.rule, search.areas)[
+            labels
+        ]
     volumes = np.bincount(labels, weights=inside, minlength=len(pieces.sizes))
-    return (volumes >= 0.9 * drop_below * volumes.max())[labels]
+    return (volumes >= 0.9 * search.drop_below * volumes.max())[labels]
 
 
 def cube_around(box: np.ndarray, resolution: int) -> Grid:

@@ -10,10 +10,10 @@ import numpy as np
 
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.hull.carving.bounds import Region, cube_around, find_region, grid_in
+from visdom_plugin.hull.carving.bounds import Region, Search, cube_around, find_region, grid_in
 from visdom_plugin.hull.carving.culling import explaining_pieces
 from visdom_plugin.hull.carving.keep_rule import KeepRule
-from visdom_plugin.hull.carving.octree import Areas, block_carve, sum_areas
+from visdom_plugin.hull.carving.octree import block_carve, sum_areas
 from visdom_plugin.hull.carving.votes import Device, Grid, Silhouettes, dense_carve
 from visdom_plugin.hull.grid.components import Pieces, choose_pieces, erase_pieces, find_pieces
 from visdom_plugin.hull.hull import Hull, occupied_box
@@ -33,18 +33,19 @@ def carve_silhouettes(
     device: Device = "cpu",
     effort: float = 1.0,
 ) -> Hull | None:
-    """The hull, or None when nothing is left; `effort` as in `find_region`."""
+    """The hull, or None when nothing is left; `effort` as in `bounds.Search`."""
     rule = KeepRule.of(settings, len(silhouettes))
     started = time.perf_counter()
-    areas = sum_areas(silhouettes)
+    fraction = 0.5 if settings.components == "largest" else settings.min_component_fraction
+    search = Search(silhouettes, sum_areas(silhouettes), rule, settings.components, fraction, effort)
     summed = time.perf_counter()
-    placed = _place(settings, cameras, silhouettes, rule, areas, effort)
+    placed = _place(settings, cameras, search)
     if placed is None:
         return None
     grid, ball, closed = placed
     located = time.perf_counter()
     policy = _policy(settings, rule)
-    found = _carve_grid(settings, policy, silhouettes, rule, areas, grid, ball, device)
+    found = _carve_grid(settings, policy, search, grid, ball, device)
     # Cells tell less than voxels: where the search kept what the voxels then lost, the grid shrinks to the rest.
     for _ in range(_TIGHTENINGS if policy == "explain" and settings.bounds is None else 0):
         if found is None:
@@ -55,7 +56,7 @@ def carve_silhouettes(
             break
         margin = np.array([[-1], [1]]) * (2 + 0.05 * (box[1] - box[0]).max())
         grid = cube_around(grid.lower + (box + margin) * grid.voxel, settings.resolution)
-        found = _carve_grid(settings, policy, silhouettes, rule, areas, grid, ball, device)
+        found = _carve_grid(settings, policy, search, grid, ball, device)
     if found is None:
         return None
     occupancy, pieces, keep = found
@@ -85,16 +86,10 @@ def carve_silhouettes(
 
 
 def _carve_grid(
-    settings: HullSettings,
-    policy: str,
-    silhouettes: Silhouettes,
-    rule: KeepRule,
-    areas: Areas,
-    grid: Grid,
-    ball: Ball | None,
-    device: Device,
+    settings: HullSettings, policy: str, search: Search, grid: Grid, ball: Ball | None, device: Device
 ) -> tuple[np.ndarray, Pieces, np.ndarray] | None:
     """Occupancy after culling, its pieces before and which of them stayed; None for an empty grid."""
+    silhouettes, areas, rule = search[:3]
     if str(device) == "cpu":
         occupancy = block_carve(silhouettes, grid, rule, areas)
     else:
@@ -113,14 +108,7 @@ def _carve_grid(
     return occupancy, pieces, keep
 
 
-def _place(
-    settings: HullSettings,
-    cameras: Cameras,
-    silhouettes: Silhouettes,
-    rule: KeepRule,
-    areas: Areas,
-    effort: float,
-) -> tuple[Grid, Ball | None, bool] | None:
+def _place(settings: HullSettings, cameras: Cameras, search: Search) -> tuple[Grid, Ball | None, bool] | None:
     """Grid, ball (centre, radius) or None, and whether the views close the region; None for no region."""
     needs_ball, bounds = settings.kind == "unit-sphere", settings.bounds
     centre = None if settings.sphere_centre is None else np.array(settings.sphere_centre, np.float64)
@@ -130,7 +118,7 @@ def _place(
         ball = centre, float(radius)
     if bounds is not None and (ball is not None or not needs_ball):
         return grid_in(np.array(bounds, np.float64), settings.resolution), ball, True
-    region = _visible_region(settings, cameras, silhouettes, rule, areas, effort)
+    region = _visible_region(settings, cameras, search)
     if region is None:
         return None
     box = region.bounds
@@ -141,7 +129,7 @@ def _place(
         return grid_in(np.array(bounds, np.float64), settings.resolution), ball, True
     if ball is not None:
         box = np.stack([ball[0] - ball[1], ball[0] + ball[1]])
-    elif _one_view_is_enough(settings, rule):
+    elif _one_view_is_enough(settings, search.rule):
         centres = cameras.centres.double().cpu().numpy()
         box = np.stack([np.minimum(box[0], centres.min(0)), np.maximum(box[1], centres.max(0))])
     return cube_around(box, settings.resolution), ball, region.closed
@@ -169,28 +157,15 @@ def _say_dropped(sizes: np.ndarray, keep: np.ndarray, policy: str, min_fraction:
     return f"dropped {np.count_nonzero(~keep)}, {share:.2g} of the volume kept: {why}"
 
 
-def _visible_region(
-    settings: HullSettings,
-    cameras: Cameras,
-    silhouettes: Silhouettes,
-    rule: KeepRule,
-    areas: Areas,
-    effort: float,
-) -> Region | None:
-    def find(rule: KeepRule) -> Region | None:
-        fraction = 0.5 if settings.components == "largest" else settings.min_component_fraction
-        return find_region(
-            cameras, silhouettes, rule, settings.components, fraction, areas=areas, effort=effort
-        )
-
+def _visible_region(settings: HullSettings, cameras: Cameras, search: Search) -> Region | None:
+    rule, views = search.rule, search.rule.views
     if settings.kind == "released-go" or (settings.kind == "visdom" and rule.least_visible > 1):
-        return find(rule)
-    views = len(silhouettes)
+        return find_region(cameras, search)
     start = KeepRule.of(replace(settings, kind="visdom"), views).least_visible
     # With K = 1 the views close nothing: the box is that of the usual K.
     start = 3 if start == 1 else start
     for k in range(min(start, views), 0, -1):
-        region = find(rule._replace(least_visible=k))
+        region = find_region(cameras, search._replace(rule=rule._replace(least_visible=k)))
         if region is not None:
             return region
     return None

@@ -68,6 +68,22 @@ def _span(a: float, b: float) -> tuple[float, float]:
     return 0.5 * (a + b), 0.5 * (b - a)
 
 
+@kernel(inline="always")
+def _bound_pixel(
+    c: int, view: int, i0: int, i1: int, j0: int, j1: int, k0: int, k1: int, x: np.ndarray, y: np.ndarray,
+    z: np.ndarray, dx: float, dy: float, dz: float, depth: float, nearest: float, slack: np.ndarray,
+) -> tuple[float, float]:  # fmt: skip
+    """Least and largest u (c = 0) or v (c = 1) of all points of a block."""
+    # u - u_c = sum of (d0_a - u_c d2_a) s_a / depth with |s_a| <= 1, so this bound is tight to first order.
+    ax, bx = _span(x[view, c, i0], x[view, c, i1])
+    ay, by = _span(y[view, c, j0], y[view, c, j1])
+    az, bz = _span(z[view, c, k0], z[view, c, k1])
+    u = (ax + ay + az) / depth
+    reach_px = abs(bx - u * dx) + abs(by - u * dy) + abs(bz - u * dz)
+    half = (reach_px + slack[view, c] + 2 * abs(u) * slack[view, 2]) / nearest + 1e-9 + 1e-12 * abs(u)
+    return u - half, u + half
+
+
 @kernel()
 def _judge(
     view: int, i0: int, i1: int, j0: int, j1: int, k0: int, k1: int, x: np.ndarray, y: np.ndarray,
@@ -85,23 +101,10 @@ def _judge(
     if nearest <= slack[view, 2]:
         return _OPEN
     width, height = sizes[view]
-    # u - u_c = sum of (d0_a - u_c d2_a) s_a / depth with |s_a| <= 1, so this bound is tight to first order.
-    ax, bx = _span(x[view, 0, i0], x[view, 0, i1])
-    ay, by = _span(y[view, 0, j0], y[view, 0, j1])
-    az, bz = _span(z[view, 0, k0], z[view, 0, k1])
-    u = (ax + ay + az) / depth
-    reach_px = abs(bx - u * dx) + abs(by - u * dy) + abs(bz - u * dz)
-    half = (reach_px + slack[view, 0] + 2 * abs(u) * slack[view, 2]) / nearest + 1e-9 + 1e-12 * abs(u)
-    u0, u1 = u - half, u + half
+    u0, u1 = _bound_pixel(0, view, i0, i1, j0, j1, k0, k1, x, y, z, dx, dy, dz, depth, nearest, slack)
     if u1 < 0 or u0 >= width:
         return _UNSEEN
-    ax, bx = _span(x[view, 1, i0], x[view, 1, i1])
-    ay, by = _span(y[view, 1, j0], y[view, 1, j1])
-    az, bz = _span(z[view, 1, k0], z[view, 1, k1])
-    v = (ax + ay + az) / depth
-    reach_px = abs(bx - v * dx) + abs(by - v * dy) + abs(bz - v * dz)
-    half = (reach_px + slack[view, 1] + 2 * abs(v) * slack[view, 2]) / nearest + 1e-9 + 1e-12 * abs(v)
-    v0, v1 = v - half, v + half
+    v0, v1 = _bound_pixel(1, view, i0, i1, j0, j1, k0, k1, x, y, z, dx, dy, dz, depth, nearest, slack)
     if v1 < 0 or v0 >= height:
         return _UNSEEN
     if u0 < 0 or v0 < 0 or u1 >= width or v1 >= height:

@@ -8,7 +8,7 @@ in float64 and in one order, which `octree` repeats, so that both agree voxel fo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -68,13 +68,6 @@ class Silhouettes:
         """(H, W) uint8 of one view."""
         (width, height), start = self.sizes[view], self.offsets[view]
         return self.pixels[start : start + width * height].reshape(height, width)
-
-    def without(self, view: int) -> Silhouettes:
-        """The same capture less one view."""
-        rest = np.arange(len(self)) != view
-        return replace(
-            self, projections=self.projections[rest], sizes=self.sizes[rest], offsets=self.offsets[rest]
-        )
 
 
 def gather_silhouettes(cameras: Cameras, masks: Masks, dilate_px: int = 0) -> Silhouettes:

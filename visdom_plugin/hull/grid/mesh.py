@@ -141,18 +141,15 @@ def _count_slabs(
     for i in range(begin, end):
         triangles, vertices = 0, 0
         for j in range(ny + 1):
-            k = 0
+            k = _next_cube(grid, i, j, 0)
             while k <= nz:
-                k = _next_cube(grid, i, j, k)
-                if k > nz:
-                    break
                 case = _case_at(grid, i, j, k)
                 triangles += counts[case]
                 # This cube owns the three edges that leave its first corner.
                 first = case & 1
                 for axis in range(3):
                     vertices += (case >> (1 << axis) & 1) != first
-                k += 1
+                k = _next_cube(grid, i, j, k + 1)
         triangles_of[i], vertices_of[i] = triangles, vertices
 
 
@@ -162,11 +159,8 @@ def _number_slab(grid: np.ndarray, i: int, first: int, ids: np.ndarray, vertices
     _, ny, nz = grid.shape
     count = first
     for j in range(ny + 1):
-        k = 0
+        k = _next_cube(grid, i, j, 0)
         while k <= nz:
-            k = _next_cube(grid, i, j, k)
-            if k > nz:
-                break
             case = _case_at(grid, i, j, k)
             for axis in range(3):
                 if (case >> (1 << axis) & 1) != (case & 1):
@@ -174,7 +168,7 @@ def _number_slab(grid: np.ndarray, i: int, first: int, ids: np.ndarray, vertices
                     vertices[count, 0], vertices[count, 1], vertices[count, 2] = i - 0.5, j - 0.5, k - 0.5
                     vertices[count, axis] += 0.5
                     count += 1
-            k += 1
+            k = _next_cube(grid, i, j, k + 1)
 
 
 @kernel()
@@ -195,21 +189,16 @@ def _build(
                 _number_slab(grid, i + 1, first_vertex[i + 1], ahead, vertices)
             f = first_triangle[i]
             for j in range(ny + 1):
-                k = 0
+                k = _next_cube(grid, i, j, 0)
                 while k <= nz:
-                    k = _next_cube(grid, i, j, k)
-                    if k > nz:
-                        break
                     case = _case_at(grid, i, j, k)
                     for t in range(counts[case]):
                         for m in range(3):
                             e = table[case, t, m]
-                            if offsets[e, 0] == 0:
-                                faces[f, m] = here[j + offsets[e, 1], k + offsets[e, 2], axes[e]]
-                            else:
-                                faces[f, m] = ahead[j + offsets[e, 1], k + offsets[e, 2], axes[e]]
+                            ids = ahead if offsets[e, 0] else here
+                            faces[f, m] = ids[j + offsets[e, 1], k + offsets[e, 2], axes[e]]
                         f += 1
-                    k += 1
+                    k = _next_cube(grid, i, j, k + 1)
             here, ahead = ahead, here
 
 

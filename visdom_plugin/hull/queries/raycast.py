@@ -264,8 +264,8 @@ def cast(hull: Hull, origins: Tensor | np.ndarray, directions: Tensor | np.ndarr
     dtype = directions.dtype if directions.is_floating_point() else torch.float64
     if directions.device.type != "cpu":
         first, last, hit = cast_with_torch(hull, origins, directions)
-        return Crossing(first.to(dtype), last.to(dtype), hit)
-    first, last, hit = _walk(hull, origins, directions, shape, both=True)
+    else:
+        first, last, hit = _walk(hull, origins, directions, shape, both=True)
     return Crossing(first.to(dtype), last.to(dtype), hit)
 
 
