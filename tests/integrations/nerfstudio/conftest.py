@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from datamodules import load
-
-from ...datamodules.prepared_writer import write_prepared
+from tests.datamodules.layouts.prepared_writer import write_prepared
 
 
 @pytest.fixture(scope="package")
