@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 
 
@@ -53,3 +54,34 @@ def list_some(names: Iterable[object], most: int = 5) -> str:
     """Names with commas between, "a, b, c, ... (9 in all)" where there are more than `most`."""
     words = [str(name) for name in names]
     return ", ".join(words[:most]) + (f", ... ({len(words)} in all)" if len(words) > most else "")
+
+
+def did_you_mean(name: object, valid: Iterable[object]) -> str:
+    """ "; did you mean 'steps'?" for the nearest of the valid names; empty where none is near."""
+    near = difflib.get_close_matches(str(name), [str(v) for v in valid], 1, 0.5)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def unknown_name(
+    what: str,
+    name: object,
+    valid: Iterable[object],
+    *,
+    where: object = None,
+    cause: str | None = None,
+    todo: str = "use one of",
+) -> ConfigError:
+    """The error for a name that is none of the valid ones: says the nearest and lists all.
+
+    Args:
+        what: The sentence that names it, e.g. "there is no metric 'pnsr'".
+        name: The name itself.
+        todo: What stands before the list.
+    """
+    names = [str(v) for v in valid]
+    return ConfigError(
+        what + did_you_mean(name, names),
+        where=where,
+        cause=cause,
+        todo=f"{todo}: {', '.join(names) or '(there is none)'}",
+    )

@@ -8,7 +8,6 @@ Nothing heavy is imported until a preset's method is loaded.
 
 from __future__ import annotations
 
-import difflib
 import logging
 import os
 import re
@@ -21,7 +20,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from visdom_plugin.errors import ConfigError, PluginError
+from visdom_plugin.errors import ConfigError, PluginError, did_you_mean
 from visdom_plugin.hooks.configs import GaussianMethodConfig, SamplerMethodConfig
 from visdom_plugin.specs import MethodSpec, Preset
 
@@ -118,20 +117,20 @@ class Registry:
         for known in (name, self.aliases.get(base, base) + plus + variant):
             if (known := self.aliases.get(known, known)) in self.presets:
                 return self.presets[known]
-        near = difflib.get_close_matches(name, [*self.presets, *self.aliases], 1, 0.5)
         if not self.presets:
             raise ConfigError(
                 f"there is no method {name!r}: no method at all is registered",
                 cause="the package is run without being installed, or was installed by an older version",
                 todo="pip install -e . (or pip install visdom-plugin)",
             )
+        skipped = ", ".join(s.origin for s in self.skipped)
+        names = [*self.presets, *self.aliases]
         raise ConfigError(
-            f"there is no method {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""),
-            cause="the methods of a package were skipped; `visdom-methods --doctor` tells why: "
-            + ", ".join(s.origin for s in self.skipped)
-            if self.skipped
+            f"there is no method {name!r}{did_you_mean(name, names)}",
+            cause=f"the methods of a package were skipped; `visdom-methods --doctor` tells why: {skipped}"
+            if skipped
             else None,
-            todo="choose one of: " + ", ".join(f"method:{n}" for n in [*self.presets, *self.aliases]),
+            todo="choose one of: " + ", ".join(f"method:{n}" for n in names),
         )
 
 

@@ -13,11 +13,9 @@ from visdom_plugin.tables.report.summary import summarise
 from visdom_plugin.tables.report.write import write_all
 from visdom_plugin.tables.results import Results
 from visdom_plugin.tables.run.jobs import plan
-from visdom_plugin.tables.spec import list_editions, list_tables, load_table
+from visdom_plugin.tables.spec import list_tables, load_table
 
-EDITIONS = [
-    (name, edition) for name, path in list_tables().items() for edition in (None, *list_editions(path))
-]
+EDITIONS = [(name, edition) for name in list_tables() for edition in (None, *load_table(name).editions)]
 
 
 def test_the_nine_tables_are_there_each_with_a_small_edition():

@@ -5,7 +5,7 @@ import yaml
 
 from tests.tables.matrix import table
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables.spec import Column, flatten, list_editions, load_table, nest, parse_table
+from visdom_plugin.tables.spec import Column, flatten, load_table, nest, parse_table
 
 CONTENT = {
     "title": "Small",
@@ -94,7 +94,7 @@ def test_editions_and_the_rows_that_they_change_may_have_numbers_for_names(tmp_p
     file.write_text(
         "rows: [{label: '7', method: a}]\ncolumns: [{label: c}]\neditions: {1: {rows: {7: {method: b}}}}"
     )
-    assert list_editions(file) == ["1"] and load_table(f"{file}:1").rows[0].method == "b"
+    assert list(load_table(file).editions) == ["1"] and load_table(f"{file}:1").rows[0].method == "b"
     with pytest.raises(ConfigError, match="editions there: 1"):
         load_table(file, "2")
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import unknown_name
 
 
 @dataclass(frozen=True)
@@ -94,9 +93,4 @@ def find_measure(name: str, where: object = None) -> Measure:
     """
     if name in MEASURES:
         return MEASURES[name]
-    near = difflib.get_close_matches(str(name), MEASURES, 1)
-    raise ConfigError(
-        f"there is no metric {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""),
-        where=where,
-        todo="choose from: " + ", ".join(MEASURES),
-    )
+    raise unknown_name(f"there is no metric {name!r}", name, MEASURES, where=where)

@@ -7,14 +7,13 @@ numbers of cameras, as printed) or "all".
 from __future__ import annotations
 
 import csv
-import difflib
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, unknown_name
 
 KEYS = ("dataset", "views", "method", "variant", "metric")
 GIVEN = ("dataset", "views", "method", "variant")
@@ -51,19 +50,13 @@ class Numbers:
         """
         for name, value in (given or {}).items():
             if name not in GIVEN:
-                raise ConfigError(
-                    f"the paper's tables have no field {name!r}", where=where, todo=f"use {', '.join(GIVEN)}"
-                )
+                what = f"the paper's tables have no field {name!r}"
+                raise unknown_name(what, name, GIVEN, where=where)
             place = KEYS.index(name)
             known = list(dict.fromkeys(key[place] for key in self.values))
             if str(value) not in known:
-                near = difflib.get_close_matches(str(value), known, 1)
-                raise ConfigError(
-                    f"the paper's table {self.name!r} has no {name} {value!r}"
-                    + (f"; did you mean {near[0]!r}?" if near else ""),
-                    where=where,
-                    todo=f"use one of: {', '.join(known)}",
-                )
+                what = f"the paper's table {self.name!r} has no {name} {value!r}"
+                raise unknown_name(what, value, known, where=where)
 
 
 def list_papers() -> list[str]:
@@ -88,11 +81,7 @@ def load_numbers(name: str) -> Numbers:
                     raise ConfigError(f"the paper's tables {name} contradict each other: {', '.join(key)}")
         return Numbers(name, values)
     if name not in known:
-        near = difflib.get_close_matches(name, known, 1)
-        raise ConfigError(
-            f"the paper's numbers have no table {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""),
-            todo=f"use one of: {', '.join(known)}",
-        )
+        raise unknown_name(f"the paper's numbers have no table {name!r}", name, known)
     text = (_folder() / f"{name}.csv").read_text(encoding="utf-8")
     return Numbers(name, read_numbers(text, name))
 

@@ -5,16 +5,15 @@ Plain data, read from YAML. Free of heavy imports.
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Literal, TypeVar
 
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, unknown_name
 from visdom_plugin.training.runs.config_io import from_plain
 
 BUILT_IN = "built-in"
@@ -30,6 +29,10 @@ FACTS = (
     "views",
 )
 """Facts of the protocol that `varies` may name; see tables.protocol."""
+Budget = Literal["auto", "quick", "full"]
+Settings = dict[str, object]
+"""What a table file says by names, checked by whoever the names belong to."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -40,13 +43,13 @@ class Row:
     """As printed; unique within the table."""
     method: str
     """Name or alias of a preset; a hull table's rows say "hull"."""
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: Settings = field(default_factory=dict)
     """Dotted path inside the method's config to its value, e.g. {"hull.k": 2}."""
-    paper: dict[str, Any] | None = None
+    paper: Settings | None = None
     """Which of the paper's rows stands beside it, e.g. {"method": "ZipNeRF", "variant": "vd"}."""
     group: str = ""
     """Rows of one group stand together."""
-    budget: str | None = None
+    budget: Budget | None = None
     """In place of the table's budget."""
 
 
@@ -64,37 +67,47 @@ class Column:
     downscale: float = 1.0
     data_format: str | None = None
     """How the scenes lie on disk; by default recognised."""
-    paper: dict[str, Any] | None = None
+    paper: Settings | None = None
     """Which of the paper's columns stands beside it, e.g. {"dataset": "MipNeRF360"}."""
-    reading: dict[str, Any] = field(default_factory=dict)
+    reading: Settings = field(default_factory=dict)
     """Other options of visdom-train on how scenes are read, e.g. {"mask_source": "alpha", "frame": 10}."""
 
 
 @dataclass(frozen=True)
-class TableSpec:
-    """A table: every row is run on every scene and number of views of every column, once per seed."""
+class TableFile:
+    """What a table file may hold."""
 
     name: str
     title: str = ""
-    kind: str = "train"
+    kind: Literal["train", "hull"] = "train"
     """"train": a job is one visdom-train run. "hull": a job carves and measures one hull."""
+    settings: Settings = field(default_factory=dict)
+    """Settings of all rows; a row's own win."""
     rows: tuple[Row, ...] = ()
     columns: tuple[Column, ...] = ()
     seeds: tuple[int, ...] = (0,)
     metrics: tuple[str, ...] = ("psnr",)
     """Names in run.json's metrics.test."""
-    budget: str = "auto"
+    budget: Budget = "auto"
     """quick, full or auto, as for visdom-train."""
     varies: tuple[str, ...] = ()
     """Facts of the protocol that may differ inside this table; see FACTS."""
     paper: str | None = None
     """Name of the CSV of the paper's numbers."""
-    layout: dict[str, Any] = field(default_factory=dict)
+    layout: Settings = field(default_factory=dict)
     """For the writers."""
     notes: tuple[str, ...] = ()
     """Printed below the table."""
-    slurm: dict[str, Any] = field(default_factory=dict)
-    """Resources on a cluster; see tables.slurm.SlurmConfig."""
+    slurm: Settings = field(default_factory=dict)
+    """Resources on a cluster; see tables.run.slurm.SlurmConfig."""
+    editions: Settings = field(default_factory=dict)
+    """Name to what is different in this edition; see `load_table`."""
+
+
+@dataclass(frozen=True)
+class TableSpec(TableFile):
+    """A table: every row is run on every scene and number of views of every column, once per seed."""
+
     source: str = ""
     """The file it was read from, for messages."""
     edition: str = ""
@@ -112,11 +125,6 @@ def list_tables() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-def list_editions(path: Path) -> list[str]:
-    """Names of a table file's editions."""
-    return list(_mapping(_read(path).get("editions", {}), "editions", path))
-
-
 def load_table(name_or_path: str | Path, edition: str | None = None) -> TableSpec:
     """Reads a table.
 
@@ -131,53 +139,29 @@ def load_table(name_or_path: str | Path, edition: str | None = None) -> TableSpe
     """
     path, edition = _find(str(name_or_path), edition)
     content = _read(path)
-    editions = _mapping(content.pop("editions", {}), "editions", path)
+    editions = content["editions"] = _mapping(content.get("editions", {}), "editions", path)
     if edition:
         if edition not in editions:
-            raise ConfigError(
-                f"the table has no edition {edition!r}{_nearest(edition, editions)}",
-                where=path,
-                todo=f"editions there: {', '.join(editions) or 'none'}",
-            )
-        content = _merge(content, _mapping(editions[edition] or {}, f"editions.{edition}", path), path)
+            what = f"the table has no edition {edition!r}"
+            raise unknown_name(what, edition, editions, where=path, todo="editions there")
+        content |= _merge(content, _mapping(editions[edition] or {}, f"editions.{edition}", path), path)
     return parse_table(content, path.stem, str(path), edition or "")
 
 
-def parse_table(content: dict[str, Any], name: str, where: str, edition: str = "") -> TableSpec:
-    """A table from plain data, as YAML holds it; see `load_table`.
-
-    Beside the fields of TableSpec, `settings` may hold settings for all rows; a row's own win.
-    """
-    content = dict(content)
-    shared = _mapping(content.pop("settings", {}), "settings", where)
-    rows = [
-        _parse(
-            Row(label="", method=""),
-            {
-                **row,
-                "settings": flatten(shared) | flatten(_mapping(row.get("settings", {}), "settings", where)),
-            },
-            f"rows[{i}]",
-            where,
-            required=("label", "method"),
-        )
-        for i, row in enumerate(_mappings(content.pop("rows", []), "rows", where))
-    ]
-    columns = [
-        _parse(Column(label=""), _tidy_column(column), f"columns[{i}]", where, required=("label",))
-        for i, column in enumerate(_mappings(content.pop("columns", []), "columns", where))
-    ]
-    for key in ("source", "edition"):
-        if key in content:
-            raise ConfigError(f"unknown setting {key!r}", where=where)
-    for key in ("seeds", "metrics", "varies", "notes"):
-        if key in content and not isinstance(content[key], (list, tuple)):
-            content[key] = [content[key]]
-    content.setdefault("name", name)
-    spec = _parse(TableSpec(name=name), content, "", where, extra=("settings", "rows", "columns", "editions"))
-    made = {f.name: getattr(spec, f.name) for f in fields(spec)}
-    made |= {"rows": tuple(rows), "columns": tuple(columns), "source": where, "edition": edition}
-    spec = TableSpec(**made)
+def parse_table(content: Settings, name: str, where: str, edition: str = "") -> TableSpec:
+    """A table from plain data, as YAML holds it; see `load_table`."""
+    content = {"name": name, **_in_brackets(content, "seeds", "metrics", "varies", "notes")}
+    rows, columns = (_mappings(content.pop(key, []), key, where) for key in ("rows", "columns"))
+    shared = flatten(_mapping(content.get("settings", {}), "settings", where))
+    for row in rows:
+        row["settings"] = shared | flatten(_mapping(row.get("settings", {}), "settings", where))
+    made = from_plain(TableFile(name), content, where)
+    spec = TableSpec(**vars(made), source=where, edition=edition)
+    spec = replace(
+        spec,
+        rows=tuple(_parse(Row("", ""), row, f"rows[{i}]", where, "method") for i, row in enumerate(rows)),
+        columns=tuple(_parse(Column(""), _tidy(c), f"columns[{i}]", where) for i, c in enumerate(columns)),
+    )
     check_spec(spec, where)
     return spec
 
@@ -194,13 +178,10 @@ def _find(text: str, edition: str | None) -> tuple[Path, str | None]:
     path = Path(text).expanduser()
     if path.is_file():
         return path, edition
-    raise ConfigError(
-        f"there is no table {text!r}{_nearest(text, shipped)}",
-        todo=f"give a YAML file or one of: {', '.join(shipped) or '(none is shipped)'}",
-    )
+    raise unknown_name(f"there is no table {text!r}", text, shipped, todo="give a YAML file or one of")
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> Settings:
     import yaml
 
     try:
@@ -215,96 +196,83 @@ def _read(path: Path) -> dict[str, Any]:
     return _mapping(content, "the file", path)
 
 
-def _merge(base: Any, change: Any, where: object) -> Any:
-    if not (isinstance(base, dict) and isinstance(change, dict)):
-        return change
+def _merge(base: Settings, change: Settings, where: object) -> Settings:
     merged = dict(base)
     for key, value in change.items():
-        if key == "rows" and isinstance(value, dict) and isinstance(base.get("rows"), list):
-            merged["rows"] = _merge_rows(base["rows"], value, where)
+        old = base.get(key)
+        if isinstance(value, dict) and isinstance(old, dict):
+            merged[key] = _merge(old, value, where)
+        elif isinstance(value, dict) and isinstance(old, list) and key == "rows":
+            merged[key] = _merge_rows(_mappings(old, "rows", where), _mapping(value, "rows", where), where)
         else:
-            merged[key] = _merge(base[key], value, where) if key in base else value
+            merged[key] = value
     return merged
 
 
-def _merge_rows(rows: list[Any], changes: dict[str, Any], where: object) -> list[Any]:
-    by_label = _mapping(changes, "rows", where)
-    rows = _mappings(rows, "rows", where)
+def _merge_rows(rows: list[Settings], by_label: Settings, where: object) -> list[Settings]:
     labels = [str(row.get("label")) for row in rows]
     for label in by_label:
         if label not in labels:
-            raise ConfigError(
-                f"an edition changes a row {label!r} that is not there{_nearest(label, labels)}",
-                where=where,
-            )
-    merged = [_merge(row, by_label.get(label, {}), where) for row, label in zip(rows, labels, strict=True)]
-    return [row for row in merged if row is not None]
+            what = f"an edition changes a row {label!r} that is not there"
+            raise unknown_name(what, label, labels, where=where, todo="rows there")
+    merged = []
+    for row, label in zip(rows, labels, strict=True):
+        change = by_label.get(label, {})
+        if change is not None:
+            merged.append(_merge(row, _mapping(change, f"rows.{label}", where), where))
+    return merged
 
 
-def _tidy_column(column: dict[str, Any]) -> dict[str, Any]:
-    """One scene or number of views may stand without brackets."""
-    tidy = dict(column)
-    for key in ("scenes", "views"):
-        if key in tidy and not isinstance(tidy[key], (list, tuple)):
-            tidy[key] = [tidy[key]]
-    if "scenes" in tidy:
-        tidy["scenes"] = [
-            str(scene) if isinstance(scene, (int, float)) else scene for scene in tidy["scenes"]
-        ]
+def _in_brackets(content: Settings, *keys: str) -> Settings:
+    """One value may stand without brackets where a list is meant."""
+    alone = {k: v for k, v in content.items() if k in keys and not isinstance(v, (list, tuple))}
+    return content | {key: [value] for key, value in alone.items()}
+
+
+def _tidy(column: Settings) -> Settings:
+    """Scenes and views as lists; scenes that YAML takes for numbers as the text they are."""
+    tidy = _in_brackets(column, "scenes", "views")
+    if isinstance(scenes := tidy.get("scenes"), (list, tuple)):
+        tidy["scenes"] = [str(scene) if isinstance(scene, (int, float)) else scene for scene in scenes]
     return tidy
 
 
-def flatten(settings: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+def flatten(settings: Mapping[str, object], path: str = "") -> Settings:
     """Nested mappings to dotted paths: {"hull": {"k": 2}} and {"hull.k": 2} say the same."""
-    flat: dict[str, Any] = {}
+    flat: Settings = {}
     for key, value in settings.items():
         name = f"{path}.{key}" if path else str(key)
         flat |= flatten(value, name) if isinstance(value, dict) else {name: value}
     return flat
 
 
-def nest(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+def nest(settings: Mapping[str, object], where: str) -> Settings:
     """Dotted paths to nested mappings, as `settings.from_plain` takes them.
 
     Raises:
         ConfigError: when one path goes on behind another one's value.
     """
-    nested: dict[str, Any] = {}
+    nested: Settings = {}
     for path, value in settings.items():
         *parents, last = path.split(".")
         inner = nested
         for parent in parents:
-            inner = inner.setdefault(parent, {})
-            if not isinstance(inner, dict):
+            deeper = inner.setdefault(parent, {})
+            if not isinstance(deeper, dict):
                 raise ConfigError(f"settings name both {parent!r} and {path!r}", where=where)
+            inner = deeper
         if isinstance(inner.get(last), dict):
             raise ConfigError(f"settings name both {path!r} and what is inside it", where=where)
         inner[last] = value
     return nested
 
 
-def _parse(
-    template: Any,
-    content: dict[str, Any],
-    path: str,
-    where: str,
-    required: tuple[str, ...] = (),
-    extra: tuple[str, ...] = (),
-) -> Any:
-    valid = [f.name for f in fields(template) if f.name not in ("source", "edition")]
-    label = path or "the top level"
-    for key in content:
-        if key not in valid:
-            every = list(dict.fromkeys([*valid, *extra]))
-            raise ConfigError(
-                f"unknown setting {key!r} at {label}{_nearest(str(key), every)}",
-                where=where,
-                todo=f"valid names at {label}: {', '.join(every)}",
-            )
-    for key in required:
-        if not content.get(key):
+def _parse(template: T, content: Settings, path: str, where: str, *required: str) -> T:
+    made = from_plain(template, content, where, path)
+    for key in ("label", *required):
+        if not getattr(made, key):
             raise ConfigError(f"{path} has no {key}", where=where)
-    return from_plain(template, content, where, path)
+    return made
 
 
 def check_spec(spec: TableSpec, where: str) -> None:
@@ -335,12 +303,9 @@ def check_spec(spec: TableSpec, where: str) -> None:
             )
     _demand_different("seeds", spec.seeds, where)
     _demand_different("metrics", spec.metrics, where)
-    _choose("kind", spec.kind, ("train", "hull"), where)
-    for row in spec.rows:
-        _choose(f"budget of row {row.label!r}", row.budget or spec.budget, ("quick", "full", "auto"), where)
     for name in spec.varies:
-        if not name.startswith("hull."):
-            _choose("a fact in varies", name, FACTS, where)
+        if not name.startswith("hull.") and name not in FACTS:
+            raise unknown_name(f"varies has no fact {name!r}", name, FACTS, where=where)
     for column in spec.columns:
         # A scene or a number of views that counts twice would weigh twice in means.
         _demand_different(f"views of column {column.label!r}", column.views, where)
@@ -359,34 +324,20 @@ def check_spec(spec: TableSpec, where: str) -> None:
             )
 
 
-def _choose(what: str, value: str, valid: tuple[str, ...], where: str) -> None:
-    if value not in valid:
-        raise ConfigError(
-            f"{what} is {value!r}{_nearest(value, valid)}",
-            where=where,
-            todo=f"use one of: {', '.join(valid)}",
-        )
-
-
-def _demand_different(what: str, values: Iterable[Any], where: str) -> None:
+def _demand_different(what: str, values: Iterable[object], where: str) -> None:
     values = list(values)
     if not values or len(set(values)) < len(values):
         shown = ", ".join(map(str, values)) or "none"
         raise ConfigError(f"{what} must be one or more different values, not {shown}", where=where)
 
 
-def _mapping(value: Any, what: str, where: object) -> dict[str, Any]:
+def _mapping(value: object, what: str, where: object) -> Settings:
     if not isinstance(value, Mapping):
         raise ConfigError(f"{what} must be a mapping, not {type(value).__name__}", where=where)
     return {str(key): entry for key, entry in value.items()}
 
 
-def _mappings(value: Any, what: str, where: object) -> list[dict[str, Any]]:
+def _mappings(value: object, what: str, where: object) -> list[Settings]:
     if not isinstance(value, (list, tuple)):
         raise ConfigError(f"{what} must be a list, not {type(value).__name__}", where=where)
     return [_mapping(entry, f"{what}[{i}]", where) for i, entry in enumerate(value)]
-
-
-def _nearest(name: str, valid: Any) -> str:
-    near = difflib.get_close_matches(name, [str(v) for v in valid], 1, 0.5)
-    return f"; did you mean {near[0]!r}?" if near else ""

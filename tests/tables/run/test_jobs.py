@@ -113,7 +113,8 @@ def test_rows_that_come_to_the_same_settings_share_a_run(tmp_path):
     [
         ({"hull.kk": 3}, "unknown setting 'hull.kk'"),
         ({"hull": {"k": "many"}}, "hull.k cannot be 'many'"),
-        ({"stps": 3}, "unknown setting 'stps'"),
+        ({"stps": 3}, "unknown setting 'stps'; did you mean 'steps'?"),
+        ({"step": 60}, "unknown setting 'step'; did you mean 'steps'?"),
         ({"rate": -1.0}, "rate is -1.0"),
         ({"steps": 3, "steps.more": 1}, "steps"),
     ],

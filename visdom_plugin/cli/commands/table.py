@@ -10,7 +10,7 @@ import tyro
 from visdom_plugin.cli.early import read_early
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.table_parts.run_table import TableOptions, change_spec, run_spec
-from visdom_plugin.tables.spec import list_editions, list_tables, load_table
+from visdom_plugin.tables.spec import list_tables, load_table
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -25,9 +25,9 @@ def _main(argv: Sequence[str]) -> int:
     if options.table == "ablation":
         return _ablation(argv)
     if options.table is None:
-        for name, path in list_tables().items():
-            spec, editions = load_table(name), list_editions(path)
-            also = f"  (editions: {', '.join(editions)})" if editions else ""
+        for name in list_tables():
+            spec = load_table(name)
+            also = f"  (editions: {', '.join(spec.editions)})" if spec.editions else ""
             sys.stdout.write(f"{name:<20} {spec.title}{also}\n")
         sys.stdout.write(f"{'ablation':<20} One method of your choice in five variants, on your scene\n")
         return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from visdom_plugin.tables.measures import MEASURES
-from visdom_plugin.tables.report.layout import Layout
 from visdom_plugin.tables.report.summary import Cell, Summary
 from visdom_plugin.tables.spec import TableSpec
 
@@ -31,29 +30,10 @@ def spell_paper(cell: Cell) -> str:
     return text if cell.difference is None else f"{text} ({measure.spell(cell.difference, signed=True)})"
 
 
-def mark_of(cell: Cell, layout: Layout) -> str:
-    """ "best", "second" or nothing, as the layout marks it."""
-    if cell.rank == 1:
-        return "best"
-    return "second" if cell.rank == 2 and layout.second else ""
-
-
-def has_paper(summary: Summary, column: int, views: int | str, measure: str) -> bool:
-    """Whether the paper prints anything for this place."""
-    place = (column, views, measure)
-    return any(c.paper is not None for c in summary.cells if (c.column, c.views, c.measure) == place)
-
-
 def heading(spec: TableSpec) -> str:
     """The table's title, with its edition."""
     title = spec.title or spec.name
     return f"{title} ({spec.edition} edition)" if spec.edition else title
-
-
-def starts_group(spec: TableSpec, r: int) -> bool:
-    """Whether the heading of a group stands above a row."""
-    group = spec.rows[r].group
-    return bool(group) and (r == 0 or spec.rows[r - 1].group != group)
 
 
 def describe_numbers(spec: TableSpec, summary: Summary) -> list[str]:

@@ -1,4 +1,4 @@
-"""Words, figures and pictures of a table's HTML page; `page.html` lays them out."""
+"""Words, figures and pictures of a table's HTML page; `table.html` lays them out."""
 
 from __future__ import annotations
 
@@ -8,20 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from visdom_plugin.tables.measures import MEASURES
-from visdom_plugin.tables.report.labels import (
-    describe_numbers,
-    describe_runs,
-    has_paper,
-    heading,
-    list_failures,
-    mark_of,
-    spell_cell,
-    spell_paper,
-    starts_group,
-)
-from visdom_plugin.tables.report.layout import Block, Layout, arrange, spell_views
+from visdom_plugin.tables.report.layout import spell_views
+from visdom_plugin.tables.report.printed import describe_table, make_environment
 from visdom_plugin.tables.report.strips import ERROR_FULL, data_uri, read_strip
-from visdom_plugin.tables.report.summary import Cell, SceneValue, Summary
+from visdom_plugin.tables.report.summary import SceneValue, Summary
 from visdom_plugin.tables.report.svg_figures import (
     Dots,
     average_curves,
@@ -52,12 +42,7 @@ def to_html(spec: TableSpec, summary: Summary) -> str:
     many = len(numbers) * len(spec.rows) > MANY
     places = [_place(spec, summary, c, views, MANY_HEIGHT_PX if many else HEIGHT_PX) for c, views in numbers]
     return _template().render(
-        title=heading(spec),
-        blocks=[_block(spec, summary, block) for block in arrange(spec)],
-        numbers=" ".join(describe_numbers(spec, summary)),
-        runs=describe_runs(spec, summary),
-        notes=spec.notes,
-        failures=list_failures(spec, summary),
+        describe_table(spec, summary),
         places=[
             place for place in places if any(place[k] for k in ("spreads", "curves", "strips", "scenes"))
         ],
@@ -68,28 +53,7 @@ def to_html(spec: TableSpec, summary: Summary) -> str:
 
 @lru_cache(maxsize=1)
 def _template() -> Template:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    loader = PackageLoader("visdom_plugin", "tables/report")
-    return Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    ).get_template("page.html")
-
-
-def _block(spec: TableSpec, summary: Summary, block: Block) -> dict[str, Any]:
-    rows = []
-    for r, row in enumerate(spec.rows):
-        cells = [summary.cell(r, h.column, h.views, h.measure) for h in block.heads]
-        words = [_cell(cell, summary.layout) for cell in cells]
-        rows.append({"group": row.group if starts_group(spec, r) else "", "label": row.label, "cells": words})
-    paper = any(has_paper(summary, h.column, h.views, h.measure) for h in block.heads)
-    return {"title": block.title, "heads": [h.title for h in block.heads], "paper": paper, "rows": rows}
-
-
-def _cell(cell: Cell, layout: Layout) -> dict[str, str]:
-    number, _, spread = spell_cell(cell).partition(" ± ")
-    kind = mark_of(cell, layout) or ("" if cell.whole else "partial" if cell.n else "absent")
-    return {"kind": kind, "number": number, "spread": spread, "paper": spell_paper(cell)}
+    return make_environment().get_template("table.html")
 
 
 def _place(spec: TableSpec, summary: Summary, c: int, views: int, height_px: int) -> dict[str, Any]:

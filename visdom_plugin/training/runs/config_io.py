@@ -7,7 +7,7 @@ from dataclasses import fields, is_dataclass, replace
 from pathlib import PurePath
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, did_you_mean, unknown_name
 
 T = TypeVar("T")
 
@@ -46,8 +46,8 @@ def from_plain(template: T, plain: Any, where: str, path: str = "") -> T:
     for name, value in plain.items():
         full = f"{path}.{name}" if path else str(name)
         if name not in valid:
-            raise ConfigError(
-                f"unknown setting {full!r}", where=where, todo=f"valid names at {label}: {', '.join(valid)}"
+            raise unknown_name(
+                f"unknown setting {full!r}", name, valid, where=where, todo=f"valid names at {label}"
             )
         current = getattr(template, name)
         if is_dataclass(current) and isinstance(value, dict):
@@ -55,7 +55,10 @@ def from_plain(template: T, plain: Any, where: str, path: str = "") -> T:
             continue
         ok, changes[name] = _coerce(value, hints[name])
         if not ok:
-            raise ConfigError(f"{full} cannot be {value!r}", where=where, todo=f"give {_spell(hints[name])}")
+            near = did_you_mean(value, _choices(hints[name]))
+            raise ConfigError(
+                f"{full} cannot be {value!r}{near}", where=where, todo=f"give {_spell(hints[name])}"
+            )
     return replace(template, **changes)
 
 
@@ -126,9 +129,17 @@ def _coerce(value: Any, hint: Any) -> tuple[bool, Any]:
     return True, value
 
 
+def _choices(hint: Any) -> list[Any]:
+    """The values of a Literal, also of one among others, in which None counts as a value."""
+    arms = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    if not all(get_origin(arm) is Literal or arm is type(None) for arm in arms):
+        return []
+    return [value for arm in arms for value in (get_args(arm) or (None,))]
+
+
 def _spell(hint: Any) -> str:
-    if get_origin(hint) is Literal:
-        return "one of " + ", ".join(repr(a) for a in get_args(hint))
+    if _choices(hint):
+        return "one of " + ", ".join(repr(a) for a in _choices(hint))
     if any(get_origin(part) is dict for part in (hint, *get_args(hint))):
         return "a mapping"
     return "a value of type " + (hint.__name__ if isinstance(hint, type) else str(hint))
