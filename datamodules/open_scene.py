@@ -27,6 +27,7 @@ from datamodules.views import splits
 from datamodules.views.find_files import ImageFiles
 from datamodules.views.lazy import LaterViews
 from datamodules.views.mask_files import assign_masks, find_ignored, looks_inverted
+from datamodules.views.named_splits import choose_named
 from datamodules.views.reader import ViewReader, map_on_cores
 from visdom_plugin.errors import SceneError, list_some
 from visdom_plugin.geometry.cameras import Cameras
@@ -68,7 +69,10 @@ def choose_files(capture: Capture, request: Request) -> Chosen:
     found = [there.find(name) for name in asked]
     notes = _note_found(capture, asked, found)
     pools = _without(capture.pools, [i for i, image in enumerate(found) if image is None], len(found))
-    split = splits.choose(capture.root, names, request, pools, indexed=capture.indexed)
+    if request.split is None:
+        split = splits.choose(capture.root, names, request, pools, indexed=capture.indexed)
+    else:
+        split = choose_named(capture.root, names, request)
     wanted = [*split.train, *split.test]
     _refuse_absent(capture.root, [asked[i] for i in wanted if found[i] is None])
     masks = assign_masks(capture, wanted, request)

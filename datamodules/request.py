@@ -24,6 +24,8 @@ class Request:
     """Training views by hand: an index file, or positions and names with commas between."""
     test_list: str | None = None
     """Test views by hand, in the same way."""
+    split: str | None = None
+    """Name of a published split (`views.named_splits`), with ":SCENE" where the folder is not named after it."""
     hold_out: bool = True
     """False lets views train that only the layout's own rule sets aside for testing (leave-one-out)."""
     frame: int | None = None

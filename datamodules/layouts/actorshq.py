@@ -9,8 +9,8 @@ metres, axes x right, y down, z forward. fx, px are fractions of the width, fy, 
 point is off centre and is kept. Cameras stand upright or lie on their side. Positions in lists are rows of the
 table, counted from 0 (Cam001 is 0). --downscale 1, 2, 4 and more take the folder of that scale.
 
-30 of the 160 cameras, evenly spread, are held out for testing, fewer of fewer in proportion: which 30 the paper
-held out is not published. Training cameras are spread evenly over the others, or listed.
+30 of the 160 cameras, evenly spread, are held out for testing, fewer of fewer in proportion. Training cameras are
+spread evenly over the others, or listed. The paper's cameras and frame are those of --split visdom.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from datamodules.files.paths import check_name, inside, read_inside
 from datamodules.files.pinholes import pinholes
 from datamodules.request import Request
 from datamodules.views import splits
+from datamodules.views.named_splits import FRAMES
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.geometry.rotations import matrix_from_quaternion
@@ -179,7 +180,10 @@ def _choose_scale(root: Path, request: Request) -> tuple[int, str]:
 
 
 def _choose_frame(root: Path, folder: str, cameras: list[dict], request: Request) -> int:
-    """The frame asked for, or the first that the first camera with photographs has."""
+    """The frame asked for, the split's, or the first that the first camera with photographs has."""
+    wanted = request.frame
+    if wanted is None and request.split is not None:
+        wanted = FRAMES.get(request.split.partition(":")[0])
     for camera in cameras:
         name = camera["name"]
         place = inside(root, f"{folder}rgbs/{name}", outside=request.allow_outside)
@@ -187,13 +191,13 @@ def _choose_frame(root: Path, folder: str, cameras: list[dict], request: Request
             continue
         pattern = re.compile(re.escape(name) + r"_rgb(\d{6})\.jpg")
         found = sorted(int(m[1]) for m in map(pattern.fullmatch, (p.name for p in place.iterdir())) if m)
-        if found and request.frame is None:
+        if found and wanted is None:
             return found[0]
-        if request.frame in found:
-            return request.frame
+        if wanted in found:
+            return wanted
         if found:
             raise SceneError(
-                f"there is no frame {request.frame}; {name} has {len(found)} from {found[0]} to {found[-1]}",
+                f"there is no frame {wanted}; {name} has {len(found)} from {found[0]} to {found[-1]}",
                 where=place,
                 todo="pass another --frame",
             )

@@ -28,8 +28,10 @@ def recognise(root: Path) -> str | None:
 
 
 def read(root: Path, request: Request) -> Capture:
-    """Reads the model in sparse/0. Index files are demanded unless both lists are given by hand."""
-    by_hand = request.train_list is not None and (request.test_list is not None or not request.test)
+    """Reads the model in sparse/0. Index files are demanded unless both lists, or a split, are given by hand."""
+    by_hand = request.split is not None or (
+        request.train_list is not None and (request.test_list is not None or not request.test)
+    )
     return colmap.read_capture(
         root, request, "prepared", folder="sparse/0", indexed=not by_hand, depths="zoe_depth"
     )

@@ -27,7 +27,7 @@ Device = Literal["auto", "cpu", "cuda"]
 Budget = Literal["quick", "full"]
 READING = (
     "views", "downscale", "seed", "missing_masks", "mask_source", "data_format", "train_list", "test_list",
-    "frame", "masks", "mask_path", "allow_outside",
+    "split", "frame", "masks", "mask_path", "allow_outside",
 )  # fmt: skip
 """Common options that say how a scene is read, kept in run.json to read it again."""
 
@@ -42,6 +42,8 @@ class Reading:
     """Training views by hand in place of --views: an index file, or positions and names with commas between."""
     test_list: str | None = None
     """Test views by hand, in the same way."""
+    split: str | None = None
+    """A published split by name: visdom. With :SCENE where the folder is not named after the data set's scene."""
     frame: int | None = None
     """Which frame of a video layout (ActorsHQ); by default the first there is."""
     masks: str | None = None

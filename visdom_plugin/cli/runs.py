@@ -82,6 +82,7 @@ def _open_noted(path: Path | None, noted: dict[str, Any], run: Path, test: bool)
     held = [noted["held_out"]] if "held_out" in noted else []
     if path is not None:
         asked |= _list_views([*noted["train"], *held], [] if held else noted["test"])
+        asked["frame"] = noted.get("frame_number")
     try:
         looked_at = test and bool(noted["test"]) and not held
         scene = open_scene(path, **asked, fill=False, test=looked_at, hold_out=not held)
@@ -104,7 +105,7 @@ def _list_views(train: Sequence[str], test: Sequence[str]) -> dict[str, Any]:
         return {}
     # A comma after the last name, so that a single one is not taken for the name of a list.
     train_list, test_list = ("".join(f"{name}," for name in names) or None for names in (train, test))
-    return {"views": len(train), "train_list": train_list, "test_list": test_list}
+    return {"views": len(train), "train_list": train_list, "test_list": test_list, "split": None}
 
 
 def open_run(run: Path, data: Path | None, device_name: str, *, test: bool = True):

@@ -209,15 +209,15 @@ def write_omni3d_video(views: Views, folder: Path, *, poses: str = "colmap") -> 
     return folder
 
 
-def write_actorshq(views: Views, folder: Path, *, frame: int = 15, scales=(1,)) -> Path:
-    """Cameras Cam001... in the order of the views; frame `frame` and an empty later one's names."""
+def write_actorshq(views: Views, folder: Path, *, frame: int = 15, scales=(1,), rig=None) -> Path:
+    """Cameras Cam001..., or of these numbers, in the order of the views; frame `frame` and a later one's box."""
     for scale in scales:
         lines = ["name,w,h,rx,ry,rz,tx,ty,tz,fx,fy,px,py"]
         for i in range(len(views.names)):
             fx, fy, cx, cy, width, height = lens(views, i)
             motion = views.cameras.world_from_camera[i].numpy()
             axis, _ = cv2.Rodrigues(motion[:3, :3])
-            name = f"Cam{i + 1:03d}"
+            name = f"Cam{i + 1 if rig is None else rig[i]:03d}"
             numbers = [*axis[:, 0], *motion[:3, 3], fx / width, fy / height, cx / width, cy / height]
             small = width // scale, height // scale
             lines.append(",".join([name, *map(str, small), *(repr(float(v)) for v in numbers)]))

@@ -52,6 +52,8 @@ class VisdomDataParserConfig(DataParserConfig):
     """Training views by hand: an index file, or positions and names with commas between."""
     test_list: Optional[str] = None  # noqa: UP045
     """Test views by hand, in the same way."""
+    split: Optional[str] = None  # noqa: UP045
+    """A published split by name: visdom. With :SCENE where the folder is not named after the data set's scene."""
     frame: Optional[int] = None  # noqa: UP045
     """Which frame of a video layout (ActorsHQ); by default the first there is."""
     mask_source: Literal["auto", "folder", "alpha"] = "auto"
@@ -116,6 +118,7 @@ class VisdomDataParser(DataParser):
             data_format=c.data_format,
             train_list=c.train_list,
             test_list=c.test_list,
+            split=c.split,
             frame=c.frame,
             mask_source=c.mask_source,
             mask_path=c.mask_path,
