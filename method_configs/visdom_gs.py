@@ -18,5 +18,5 @@ SPEC = MethodSpec(
     _PAPER.target,
     quick=replace(_PAPER.quick, **_INSIDE),
     full=replace(_PAPER.full, **_INSIDE),
-    description="Gaussian splatting from few photographs, started in the smoothest shape inside the visible domain",
+    description="Gaussians that start in the smoothest shape inside the visible domain",
 )
