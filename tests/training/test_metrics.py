@@ -176,3 +176,20 @@ def test_ssim_with_ignored_pixels_charges_the_others_with_all_that_differs():
     )
     whole = float(ssim(x.float(), y.float()))
     assert found == pytest.approx(1 - (1 - whole) * 48 / 30, abs=1e-9) and found < whole
+
+
+def test_ssim_over_uniform_windows_is_the_mean_over_all_windows_inside():
+    """The definition, written out: sample variances over each 7 x 7 window, channels apart."""
+    generator = torch.Generator().manual_seed(4)
+    x, y = torch.rand(2, 13, 11, 3, generator=generator, dtype=torch.float64)
+    values = []
+    for channel in range(3):
+        for row in range(13 - 6):
+            for column in range(11 - 6):
+                a, b = (z[row : row + 7, column : column + 7, channel].flatten() for z in (x, y))
+                covariance = torch.cov(torch.stack([a, b]))
+                luminance = (2 * a.mean() * b.mean() + 1e-4) / (a.mean() ** 2 + b.mean() ** 2 + 1e-4)
+                contrast = (2 * covariance[0, 1] + 9e-4) / (covariance[0, 0] + covariance[1, 1] + 9e-4)
+                values.append(float(luminance * contrast))
+    assert metrics.ssim_uniform7(x, y) == pytest.approx(sum(values) / len(values), abs=1e-12)
+    assert metrics.ssim_uniform7(x, x) == pytest.approx(1) and math.isnan(metrics.ssim_uniform7(x[:6], y[:6]))

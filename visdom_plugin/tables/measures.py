@@ -58,8 +58,9 @@ MEASURES: dict[str, Measure] = {
     m.name: m
     for m in (
         _of_test("psnr", "PSNR (dB)", True, 2, "psnr_db"),
-        _of_test("ssim", "SSIM", True, 4, "ssim"),
-        _of_test("lpips", "LPIPS x 100", False, 3, "lpips_x100", 100.0),
+        _of_test("ssim", "SSIM (Gaussian)", True, 4),
+        _of_test("ssim_uniform7", "SSIM (7 x 7)", True, 4, "ssim"),
+        _of_test("lpips", "LPIPS x 100 (VGG)", False, 3, "lpips_x100", 100.0),
         _of_test("psnr_per_channel", "PSNR per channel (dB)", True, 2),
         _of_test("psnr_foreground", "PSNR of the foreground (dB)", True, 2),
         _of_test("silhouette_iou", "silhouette IoU", True, 4),
