@@ -99,6 +99,10 @@ def long_table(seconds: float = 0.02) -> TableSpec:
     return table(rows, settings={"steps": 10, "seconds": seconds})
 
 
+def table_of(folder):
+    return (folder / "table.txt").read_text()
+
+
 if __name__ == "__main__":
     target = Path(sys.argv[1])
     run_plan(make(target, long_table()), Local(2, threads=1), write(target))

@@ -1,36 +1,23 @@
 from __future__ import annotations
 
-import contextlib
 import fcntl
-import io
 import json
-import math
 import os
-import random
-import re
 import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
 
 import pytest
 
-from tests.tables.matrix import ROOT, long_table, make, table, write
+from tests.tables.matrix import ROOT, make, table, table_of, write
+from tests.tables.run.scripted import Scripted
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables.results import Outcome
-from visdom_plugin.tables.run import driver, executors, job_files, progress
+from visdom_plugin.tables.run import driver, executors, job_files
 from visdom_plugin.tables.run.driver import run_plan
 from visdom_plugin.tables.run.executors import Ended, Here, Local
 from visdom_plugin.tables.run.job_files import is_held
 from visdom_plugin.tables.run.jobs import Task
-from visdom_plugin.tables.run.progress import Overview, spell_seconds
-
-
-@pytest.fixture(autouse=True)
-def from_the_root(monkeypatch):
-    monkeypatch.chdir(ROOT)
 
 
 def _statuses(results):
@@ -39,21 +26,6 @@ def _statuses(results):
 
 def _starts(made):
     return [len((d / "starts").read_text()) if (d / "starts").exists() else 0 for d in made.tasks]
-
-
-def _table_of(folder):
-    return (folder / "table.txt").read_text()
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    """The table of `long_table`, made in one go."""
-    folder = tmp_path_factory.mktemp("whole")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(ROOT)
-        run_plan(make(folder, long_table(0)), Local(2, threads=1), write(folder))
-    assert _table_of(folder).count(" finished ") == 4 and _table_of(folder).count("no such thing") == 2
-    return _table_of(folder)
 
 
 def test_this_process_and_others_make_the_same_table_and_a_second_time_runs_nothing(tmp_path):
@@ -72,7 +44,7 @@ def test_this_process_and_others_make_the_same_table_and_a_second_time_runs_noth
         assert errors == {"no\n  what to do: mend it", "RuntimeError: the floor is lava"}
         again = run_plan(make(folder, table(rows)), executor, write(folder))
         assert _starts(made) == [1] * 8 and again.outcomes == results.outcomes
-        tables.append(_table_of(folder))
+        tables.append(table_of(folder))
     assert tables[0] == tables[1]
 
 
@@ -92,7 +64,7 @@ def test_failed_runs_are_tried_again_only_when_asked(tmp_path, monkeypatch):
     assert _statuses(run_plan(made, Here(), write(tmp_path))) == ["failed"] * 2
     assert _starts(made) == [1, 1]
     assert _statuses(run_plan(made, Here(), write(tmp_path), retry=True)) == ["finished"] * 2
-    assert _starts(made) == [2, 2] and " None None" not in _table_of(tmp_path)
+    assert _starts(made) == [2, 2] and " None None" not in table_of(tmp_path)
 
 
 @pytest.mark.parametrize("retry", [False, True])
@@ -177,70 +149,6 @@ def test_two_protocols_among_finished_runs_end_the_table(tmp_path):
         run_plan(made, Here(), write(tmp_path))
 
 
-def _drive(folder):
-    return subprocess.Popen([sys.executable, "-m", "tests.tables.matrix", str(folder)], cwd=ROOT)
-
-
-def _wait_for_children(made):
-    until = time.monotonic() + 120
-    while any(is_held(d) for d in made.tasks):
-        assert time.monotonic() < until, "a child outlives its driver"
-        time.sleep(0.05)
-
-
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_a_driver_stopped_at_any_moment_leaves_a_table_that_ends_the_same(tmp_path, undisturbed, number):
-    made = make(tmp_path, long_table())
-    draw = random.Random(time.time_ns())
-    for _ in range(2):
-        process = _drive(tmp_path)
-        time.sleep(draw.uniform(0.3, 1.6))
-        process.send_signal(number)
-        process.wait(120)
-        if number == signal.SIGKILL:
-            _wait_for_children(made)
-        else:
-            # An orderly end waits for the children itself.
-            assert not any(is_held(d) for d in made.tasks)
-        if (tmp_path / "table.txt").exists():
-            # An error goes on in lines of its own.
-            assert sum(not line.startswith(" ") for line in _table_of(tmp_path).splitlines()) == 6
-    assert _drive(tmp_path).wait(300) == 0
-    assert _table_of(tmp_path) == undisturbed
-
-
-def test_workers_killed_at_random_leave_no_trace(tmp_path, undisturbed):
-    made = make(tmp_path, long_table())
-    executor = Local(2, threads=1)
-    draw, kills = random.Random(time.time_ns()), []
-    started = executor.start
-
-    def start_and_kill(tasks):
-        started(tasks)
-        for pid in executor.processes():
-            if len(kills) < 3 and pid not in kills:
-                kills.append(pid)
-                threading.Timer(draw.uniform(0.05, 0.5), _kill, (pid,)).start()
-
-    executor.start = start_and_kill
-    results = run_plan(made, executor, write(tmp_path))
-    assert results.complete and len(kills) == 3
-    assert _table_of(tmp_path) == undisturbed
-
-
-def _kill(pid):
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
-
-
-def test_two_drivers_on_one_folder_make_the_table_of_one(tmp_path, undisturbed):
-    both = [_drive(tmp_path) for _ in range(2)]
-    assert [process.wait(300) for process in both] == [0, 0]
-    assert _table_of(tmp_path) == undisturbed
-    left = {"".join(p.suffixes) for p in (tmp_path / "runs").iterdir() if p.is_file()}
-    assert left == {".yaml", ".log", ".error.json"}
-
-
 def test_every_driver_hears_its_own_process_and_leaves_no_file_of_it(tmp_path, monkeypatch):
     (tmp_path / "speaker.py").write_text(
         "import pathlib, sys, time\n"
@@ -268,33 +176,6 @@ def test_every_driver_hears_its_own_process_and_leaves_no_file_of_it(tmp_path, m
     assert list((tmp_path / "runs").iterdir()) == []
 
 
-class Scripted:
-    """An executor whose tasks end as a test says, one per poll and the last one first; two of them run."""
-
-    pause = 0.0
-
-    def __init__(self, end):
-        self.end, self.tasks = end, []
-
-    def free(self):
-        return 9
-
-    def adopt(self, tasks):
-        return []
-
-    def start(self, tasks):
-        self.tasks += tasks
-
-    def queued(self):
-        return {task.run_dir for task in self.tasks[:-2]}
-
-    def poll(self):
-        return [self.end(self.tasks.pop())]
-
-    def stop(self):
-        pass
-
-
 def test_what_another_driver_noted_is_kept_and_a_busy_process_is_not_heard(tmp_path, monkeypatch):
     monkeypatch.setattr(driver, "BUSY_PAUSE", 0.0)
     made = make(tmp_path, table(seeds=[0]))
@@ -315,91 +196,6 @@ def test_what_another_driver_noted_is_kept_and_a_busy_process_is_not_heard(tmp_p
     assert seen == [(two, False), (one, False), (one, False)]
     assert [o.error for o in results.outcomes.values()] == ["said to the other driver", "Error: two"]
     assert log.read_text() == "and not to this one"
-
-
-def _watch(made, folder, executor, **changes):
-    """Everything that the overview says of a table."""
-    said = io.StringIO()
-    run_plan(made, executor, write(folder), overview=Overview(stream=said), **changes)
-    return said.getvalue()
-
-
-def _counts(said):
-    """(done, of, running) of every line that says how far it is."""
-    return [
-        tuple(map(int, found))
-        for found in re.findall(r"^(\d+)/(\d+) done, (\d+) running", said, re.MULTILINE)
-    ]
-
-
-@pytest.mark.parametrize("executor", [Here, lambda tick: Local(1, threads=1)])
-def test_progress_counts_the_runs_asked_for(tmp_path, monkeypatch, executor):
-    monkeypatch.setattr(progress, "EVERY", math.inf)
-    rows = [
-        {"label": "Good", "method": "one"},
-        {"label": "Bad", "method": "two", "settings": {"crash": True}},
-    ]
-    rows.append({"label": "Later", "method": "three+vd"})
-    made, shown = make(tmp_path, table(rows)), Overview(stream=io.StringIO())
-    run_plan(made, executor(shown.tick), write(tmp_path), only=[0, 1], overview=shown)
-    said = shown.stream.getvalue()
-    assert "4 runs in all, 0 of them done before, 4 to do" in said
-    assert said.count("finished: Good") == 2 and said.count("lava") == 2
-    # After each end comes a line that knows what runs next; the last one says no time.
-    assert _counts(said) == [(1, 4, 1), (2, 4, 1), (3, 4, 1), (4, 4, 0)]
-    assert said.endswith("4/4 done, 0 running, 2 failed\n")
-    assert "4 runs in all, 2 of them done before, 2 failed before, 0 to do" in _watch(
-        made, tmp_path, Here(), only=[0, 1]
-    )
-    assert "2 runs in all, 0 of them done before, 2 to do" in _watch(made, tmp_path, Here(), only=[2])
-
-
-def test_a_quiet_overview_is_silent(tmp_path):
-    said = io.StringIO()
-    run_plan(make(tmp_path), Here(), write(tmp_path), overview=Overview(quiet=True, stream=said))
-    assert said.getvalue() == ""
-
-
-def test_what_waits_in_a_queue_is_not_running(tmp_path, monkeypatch):
-    monkeypatch.setattr(progress, "EVERY", 0.0)
-    said = _watch(
-        make(tmp_path, table(seeds=[0, 1, 2])), tmp_path, Scripted(lambda task: Ended(task, 1, "no"))
-    )
-    assert _counts(said) == [(0, 6, 2), (1, 6, 2), (2, 6, 2), (3, 6, 2), (4, 6, 2), (5, 6, 1), (6, 6, 0)]
-
-
-def test_the_time_left_is_shared_by_what_runs(tmp_path):
-    tasks = make(tmp_path, table(seeds=list(range(9)))).tasks
-    for running in (1, 2, 4):
-        said = io.StringIO()
-        shown = Overview(stream=said)
-        known = dict.fromkeys(tasks, Outcome("waiting"))
-        known |= dict.fromkeys(list(tasks)[:running], Outcome("running"))
-        shown.begin(tasks, known)
-        known[list(tasks)[-1]] = Outcome(
-            "finished", {"timing": {"hull_s": 1.0, "train_s": 6.0, "eval_s": 1.0}}
-        )
-        shown.report(tasks[list(tasks)[-1]], known[list(tasks)[-1]])
-        shown.show(known)
-        # 17 of 18 are left, of 8 seconds each.
-        assert (
-            f"1/18 done, {running} running, about {spell_seconds(17 * 8 / running)} left\n" in said.getvalue()
-        )
-
-
-def test_steps_of_an_earlier_time_say_nothing_of_the_time_left(tmp_path, monkeypatch):
-    monkeypatch.setattr(progress, "EVERY", 0.0)
-    tasks = make(tmp_path, table(settings={"steps": 100}, seeds=[0])).tasks
-    run_dir = next(iter(tasks))
-    said = io.StringIO()
-    shown, known = Overview(stream=said), dict.fromkeys(tasks, Outcome("waiting"))
-    for step in (50, 51):
-        job_files.write_json(run_dir / f"checkpoints/step-{step}.json", {})
-        if step == 50:
-            shown.begin(tasks, known)
-            known[run_dir] = Outcome("running")
-        shown.show(known)
-        assert ("left" in said.getvalue()) == (step > 50)
 
 
 def test_only_old_leftovers_are_removed(tmp_path):
