@@ -16,8 +16,8 @@ import tyro
 from datamodules.recognise import FORMATS
 from visdom_plugin import registry
 from visdom_plugin.cli.early import WORD, Early, read_early
-from visdom_plugin.errors import ConfigError
-from visdom_plugin.training.runs.config_io import as_plain, differences, from_plain
+from visdom_plugin.errors import ConfigError, unknown_name
+from visdom_plugin.training.runs.config_io import as_plain, differences, from_plain, read_mapping
 
 if TYPE_CHECKING:
     DataFormat = str
@@ -288,23 +288,10 @@ def resolve_device(device: str) -> str:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    import yaml
-
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"the config file cannot be read: {error.strerror}", where=path) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the config file is not YAML: {error}", where=path) from error
-    content = {} if content is None else content
-    if not isinstance(content, dict):
-        raise ConfigError(f"the config file holds {type(content).__name__}, not settings", where=path)
+    content = read_mapping(path, "the config file")
     valid = ("method", *SAVED, "settings")
     for key in content:
         if key not in valid:
-            raise ConfigError(
-                f"unknown setting {key!r}",
-                where=path,
-                todo=f"valid names at the top level: {', '.join(valid)}",
-            )
+            what = f"unknown setting {key!r}"
+            raise unknown_name(what, key, valid, where=path, todo="valid names at the top level")
     return content

@@ -14,7 +14,7 @@ from pathlib import Path, PurePath
 from typing import Literal, TypeVar
 
 from visdom_plugin.errors import ConfigError, unknown_name
-from visdom_plugin.training.runs.config_io import from_plain
+from visdom_plugin.training.runs.config_io import from_plain, read_mapping
 
 BUILT_IN = "built-in"
 """Root and scene name of the scene that needs no folder."""
@@ -138,7 +138,7 @@ def load_table(name_or_path: str | Path, edition: str | None = None) -> TableSpe
             values of the wrong type, double labels, and an unknown edition.
     """
     path, edition = _find(str(name_or_path), edition)
-    content = _read(path)
+    content: Settings = read_mapping(path, "the table")
     editions = content["editions"] = _mapping(content.get("editions", {}), "editions", path)
     if edition:
         if edition not in editions:
@@ -179,21 +179,6 @@ def _find(text: str, edition: str | None) -> tuple[Path, str | None]:
     if path.is_file():
         return path, edition
     raise unknown_name(f"there is no table {text!r}", text, shipped, todo="give a YAML file or one of")
-
-
-def _read(path: Path) -> Settings:
-    import yaml
-
-    try:
-        # libyaml's parser, where it is there, takes a tenth of the time.
-        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-        content = yaml.load(Path(path).read_text(encoding="utf-8"), Loader=loader)
-    except OSError as error:
-        raise ConfigError(f"the table cannot be read: {error.strerror}", where=path) from error
-    except (yaml.YAMLError, ValueError) as error:
-        # ValueError: no text, or a date that no calendar has.
-        raise ConfigError(f"the table is not YAML: {error}", where=path) from error
-    return _mapping(content, "the file", path)
 
 
 def _merge(base: Settings, change: Settings, where: object) -> Settings:

@@ -54,7 +54,7 @@ class Executor(Protocol):
 
     def adopt(self, tasks: Sequence[Task]) -> list[Task]:
         """Those of the tasks that an earlier driver left running here; they are polled like started ones."""
-        ...
+        return []
 
     def start(self, tasks: Sequence[Task]) -> None:
         """Starts up to `free()` tasks, whose settings are written."""
@@ -62,7 +62,7 @@ class Executor(Protocol):
 
     def queued(self) -> Collection[Path]:
         """Run directories of started tasks that still wait for a place to run."""
-        ...
+        return ()
 
     def poll(self) -> list[Ended]:
         """Tasks that ended since the last call."""
@@ -70,10 +70,10 @@ class Executor(Protocol):
 
     def stop(self) -> None:
         """Stops what would end with the driver, in a state that can be resumed, and waits for it."""
-        ...
+        return None
 
 
-class Here:
+class Here(Executor):
     """One task at a time, in this process. `tick` is called at its start and every two seconds while it runs."""
 
     pause = 0.0
@@ -84,9 +84,6 @@ class Here:
 
     def free(self) -> int:
         return 1 - len(self._ended)
-
-    def adopt(self, tasks: Sequence[Task]) -> list[Task]:
-        return []
 
     def start(self, tasks: Sequence[Task]) -> None:
         for task in tasks:
@@ -113,22 +110,16 @@ class Here:
                 raise KeyboardInterrupt
             self._ended.append(Ended(task, code, said.getvalue()))
 
-    def queued(self) -> Collection[Path]:
-        return ()
-
     def poll(self) -> list[Ended]:
         ended, self._ended = self._ended, []
         return ended
-
-    def stop(self) -> None:
-        pass
 
     def _watch(self, done: threading.Event) -> None:
         while not done.wait(2):
             self.tick()
 
 
-class Local:
+class Local(Executor):
     """N processes of this machine, the cores divided among them.
 
     A child whose driver dies is told to stop by the kernel (Linux) and leaves a state that can be resumed.
@@ -150,16 +141,12 @@ class Local:
     def free(self) -> int:
         return self.workers - len(self._children)
 
-    def adopt(self, tasks: Sequence[Task]) -> list[Task]:
-        return []
-
     def start(self, tasks: Sequence[Task]) -> None:
         for task in tasks:
             # Without a name: no other driver's child can write to it, and no killed driver leaves it behind.
             said = tempfile.TemporaryFile()  # noqa: SIM115
-            command = [sys.executable, "-m", "visdom_plugin.tables.run.worker", "--parent", str(os.getpid())]
             child = subprocess.Popen(
-                [*command, task.module, *task.argv],
+                worker_command(task.module, task.argv),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=said,
@@ -169,9 +156,6 @@ class Local:
                 start_new_session=True,
             )
             self._children[child] = task, said
-
-    def queued(self) -> Collection[Path]:
-        return ()
 
     def poll(self) -> list[Ended]:
         ended = []
@@ -198,6 +182,19 @@ class Local:
     def processes(self) -> dict[int, Task]:
         """Process ids of what runs now."""
         return {child.pid: task for child, (task, _) in self._children.items()}
+
+
+def worker_command(module: str, argv: Sequence[str]) -> list[str]:
+    """The command line of a child that does a task and ends when this process does; see `worker`."""
+    return [
+        sys.executable,
+        "-m",
+        "visdom_plugin.tables.run.worker",
+        "--parent",
+        str(os.getpid()),
+        module,
+        *argv,
+    ]
 
 
 def environment(threads: int) -> Mapping[str, str]:

@@ -13,6 +13,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from visdom_plugin.errors import ConfigError, SceneError, list_some
 from visdom_plugin.tables.protocol import Fact, facts_of_settings, refuse_mixture
 from visdom_plugin.tables.results import Job, Outcome
 from visdom_plugin.tables.run.job_files import beside
-from visdom_plugin.tables.spec import BUILT_IN, Column, Row, TableSpec, nest
+from visdom_plugin.tables.spec import BUILT_IN, Column, Row, Settings, TableSpec, nest
 from visdom_plugin.training.runs.config_io import as_plain, from_plain
 
 log = logging.getLogger(__name__)
@@ -47,10 +48,10 @@ class Workshop:
     """(kind, method, budget) to the method's settings; None where no such method is installed."""
     modules: Mapping[str, str]
     """Kind to the module whose `main(argv) -> exit status` does such a job."""
-    hash_data: Callable[[str, Path | None, Mapping[str, Any], Any], str]
+    hash_data: Callable[[str, Path | None, Settings, object], str]
     """(kind, scene's folder or None for the built-in scene, how it is read, the row's settings) to a hash of all
     data that such a job reads."""
-    tidy_reading: Callable[[Mapping[str, Any], str], dict[str, Any]] = lambda reading, where: dict(reading)
+    tidy_reading: Callable[[Settings, str], Settings] = lambda reading, where: dict(reading)
     """(a column's `reading`, where it stands) to the same, checked, with full paths."""
     device: str = "auto"
 
@@ -62,7 +63,7 @@ class Task:
     run_dir: Path
     module: str
     argv: tuple[str, ...]
-    content: dict[str, Any] = field(repr=False, default_factory=dict)
+    content: Settings = field(repr=False, default_factory=dict)
     """What its settings file holds."""
     steps: int = 0
     """Length of its schedule, where known."""
@@ -125,22 +126,17 @@ def plan(spec: TableSpec, runs: Path, workshop: Workshop, roots: Mapping[str, Pa
         log.info("looking at the files of %d scenes", len(looked_at))
     jobs: dict[Job, Outcome] = {}
     tasks: dict[Path, Task] = {}
-    for i, found in enumerate(resolved):
-        for j, (column, paths) in enumerate(zip(spec.columns, folders, strict=True)):
-            for scene in column.scenes:
-                for views in column.views:
-                    for seed in spec.seeds:
-                        job = Job(i, j, scene, views, seed)
-                        if found is None:
-                            jobs[job] = Outcome("not available")
-                        elif paths is None:
-                            jobs[job] = Outcome("no data")
-                        else:
-                            reading: dict[str, Any] = {"views": views, "downscale": column.downscale}
-                            reading |= {"data_format": column.data_format, **readings[j]}
-                            task = _make_task(spec, job, found, paths[scene], reading, runs, workshop)
-                            task = tasks.setdefault(task.run_dir, task)
-                            jobs[replace(job, run_dir=task.run_dir, argv=task.argv)] = Outcome("waiting")
+    for (i, found), (j, column) in product(enumerate(resolved), enumerate(spec.columns)):
+        paths = folders[j]
+        for scene, views, seed in product(column.scenes, column.views, spec.seeds):
+            job = Job(i, j, scene, views, seed)
+            if found is None or paths is None:
+                jobs[job] = Outcome("not available" if found is None else "no data")
+                continue
+            reading = {"views": views, "downscale": column.downscale, "data_format": column.data_format}
+            task = _make_task(spec, job, found, paths[scene], reading | readings[j], runs, workshop)
+            task = tasks.setdefault(task.run_dir, task)
+            jobs[replace(job, run_dir=task.run_dir, argv=task.argv)] = Outcome("waiting")
     return Plan(spec, jobs, tasks)
 
 
@@ -213,32 +209,22 @@ def _find_scenes(spec: TableSpec, column: Column, roots: dict[str, Path]) -> dic
     return found
 
 
-def _hash_data(
-    spec: TableSpec,
-    job: Job,
-    found: Resolved,
-    folder: Path | None,
-    reading: dict[str, Any],
-    workshop: Workshop,
-) -> str:
-    try:
-        return workshop.hash_data(spec.kind, folder, reading, found.config)
-    except SceneError as error:
-        # Its run fails with the same words and does not stop the others; once mended it is another run.
-        return f"cannot be read: {error}"
-    except ConfigError as error:
-        raise _within(_place(spec, spec.columns[job.column]), error) from error
-
-
 def _make_task(
     spec: TableSpec,
     job: Job,
     found: Resolved,
     folder: Path | None,
-    reading: dict[str, Any],
+    reading: Settings,
     runs: Path,
     workshop: Workshop,
 ) -> Task:
+    try:
+        data = workshop.hash_data(spec.kind, folder, reading, found.config)
+    except SceneError as error:
+        # Its run fails with the same words and does not stop the others; once mended it is another run.
+        data = f"cannot be read: {error}"
+    except ConfigError as error:
+        raise _within(_place(spec, spec.columns[job.column]), error) from error
     settings = as_plain(found.config)
     scene = folder.name if folder is not None else job.scene
     identity = {
@@ -249,7 +235,7 @@ def _make_task(
         "seed": job.seed,
         "scene": scene,
         "reading": reading,
-        "data": _hash_data(spec, job, found, folder, reading, workshop),
+        "data": data,
     }
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
     name = f"{found.name}-{scene}-{job.views}-s{job.seed}"

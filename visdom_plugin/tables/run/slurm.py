@@ -10,12 +10,10 @@ batch is on disk before the batch is submitted (see tables.batches), and whoever
 from __future__ import annotations
 
 import logging
-import os
 import secrets
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Collection, Mapping, Sequence
@@ -25,12 +23,19 @@ from typing import Any
 
 from visdom_plugin.atomic_files import write_json
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.tables.run.executors import PATIENCE, Ended, environment, read_all
+from visdom_plugin.tables.run.executors import (
+    PATIENCE,
+    Ended,
+    Executor,
+    environment,
+    read_all,
+    worker_command,
+)
 from visdom_plugin.tables.run.job_files import beside, read_json
 from visdom_plugin.tables.run.jobs import Task
-from visdom_plugin.tables.run.slurm_notes import Notes, Place, SlurmError, find_places, look_up
-from visdom_plugin.tables.spec import TableSpec
-from visdom_plugin.training.runs.config_io import from_plain
+from visdom_plugin.tables.run.slurm_notes import Batch, Notes, Place, SlurmError, find_places, look_up
+from visdom_plugin.tables.spec import Settings, TableSpec
+from visdom_plugin.training.runs.config_io import from_plain, read_mapping
 
 ARRAY = 1000
 """Tasks per array: Slurm's default MaxArraySize is 1001."""
@@ -62,7 +67,7 @@ class SlurmConfig:
     """Tasks of an array at a time."""
     setup: tuple[str, ...] = ()
     """Shell commands before the task, e.g. "module load cuda"."""
-    options: dict[str, Any] | None = None
+    options: Settings | None = None
     """Further options of sbatch by their long names, e.g. {"reservation": "night"}."""
     poll_seconds: float = 10.0
     """Between two questions to the queue."""
@@ -77,16 +82,10 @@ def read_config(spec: TableSpec, file: Path | None) -> SlurmConfig:
     config = from_plain(SlurmConfig(), spec.slurm, spec.source, "slurm")
     if file is None:
         return config
-    import yaml
-
-    try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the file of Slurm's resources cannot be read: {error}", where=file) from error
-    return from_plain(config, content or {}, str(file))
+    return from_plain(config, read_mapping(file, "the file of Slurm's resources"), str(file))
 
 
-class Slurm:
+class Slurm(Executor):
     """Submits tasks as arrays and watches them. They go on when the driver is stopped."""
 
     def __init__(self, config: SlurmConfig, folder: Path):
@@ -181,7 +180,7 @@ class Slurm:
             tasks = self._leave_out_submitted(tasks, batches)
             if not tasks:
                 return
-            note = {"id": None, "time": time.time(), "runs": [task.run_dir.name for task in tasks]}
+            note: Batch = {"id": None, "time": time.time(), "runs": [task.run_dir.name for task in tasks]}
             batches[name] = note
         c = self.config
         wanted = {
@@ -224,11 +223,11 @@ class Slurm:
                 todo="change the resources in the table's `slurm:` or with --slurm FILE",
             ) from error
         with self._notes.changing() as batches:
-            batches[name] = note | {"id": str(jobs[0].job_id).partition("_")[0]}
+            batches[name] = {**note, "id": str(jobs[0].job_id).partition("_")[0]}
         for index, task in enumerate(tasks):
             self._active[task.run_dir] = task, (name, index)
 
-    def _leave_out_submitted(self, tasks: Sequence[Task], batches: Mapping[str, Any]) -> list[Task]:
+    def _leave_out_submitted(self, tasks: Sequence[Task], batches: Mapping[str, Batch]) -> list[Task]:
         """The tasks that are not on the cluster; the others are watched like those of this driver."""
         places = find_places(batches)
         noted = {places[task.run_dir.name][0] for task in tasks if task.run_dir.name in places}
@@ -247,7 +246,9 @@ class Slurm:
         """Asks the queue. Tasks that it did not list ABSENT times in a row; they are no longer watched."""
         self._asked = time.monotonic()
         notes = self._notes.read()
-        queue = look_up({name: notes.get(name, {}) for _, (name, _) in self._active.values()})
+        # Another driver may have removed the note, and the jobs be in the queue yet.
+        gone: Batch = {"id": None, "time": 0.0, "runs": []}
+        queue = look_up({name: notes.get(name, gone) for _, (name, _) in self._active.values()})
         self._note_running(queue)
         lost = []
         for run_dir, (task, place) in list(self._active.items()):
@@ -282,18 +283,7 @@ def run_task(module: str, argv: list[str], run_dir: str, batch: str, cpus: int) 
     path = Path(run_dir)
     with tempfile.TemporaryFile() as said:
         child = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "visdom_plugin.tables.run.worker",
-                "--parent",
-                str(os.getpid()),
-                module,
-                *argv,
-            ],
-            stdin=subprocess.DEVNULL,
-            stderr=said,
-            env=environment(cpus),
+            worker_command(module, argv), stdin=subprocess.DEVNULL, stderr=said, env=environment(cpus)
         )
         try:
             code = child.wait()

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from visdom_plugin.atomic_files import write_json
 from visdom_plugin.errors import VisDomError
@@ -28,6 +28,17 @@ Place = tuple[str, int]
 """The name of a batch and a position in it."""
 
 
+class Batch(TypedDict):
+    """What slurm.json holds of a batch."""
+
+    id: str | None
+    """Of the array; None until Slurm has named it."""
+    time: float
+    """Of the note, in seconds since 1970."""
+    runs: list[str]
+    """Names of run directories."""
+
+
 class SlurmError(VisDomError):
     """The cluster cannot be asked, or refuses a job."""
 
@@ -38,12 +49,12 @@ class Notes:
     def __init__(self, folder: Path):
         self.folder = folder
 
-    def read(self) -> dict[str, Any]:
+    def read(self) -> dict[str, Batch]:
         """All batches; none where nothing is noted."""
         return dict((read_json(self.folder / "slurm.json") or {}).get("batches") or {})
 
     @contextmanager
-    def changing(self) -> Iterator[dict[str, Any]]:
+    def changing(self) -> Iterator[dict[str, Batch]]:
         """The batches, to be changed in place; nobody else changes them until the block is left."""
         import fcntl
 
@@ -55,18 +66,18 @@ class Notes:
             write_json(self.folder / "slurm.json", {"batches": batches})
 
 
-def find_places(batches: Mapping[str, Any]) -> dict[str, Place]:
+def find_places(batches: Mapping[str, Batch]) -> dict[str, Place]:
     """Names of run directories to where they were submitted last."""
     return {run: (name, index) for name, batch in batches.items() for index, run in enumerate(batch["runs"])}
 
 
-def look_up(batches: Mapping[str, Any]) -> dict[Place, str]:
+def look_up(batches: Mapping[str, Batch]) -> dict[Place, str]:
     """The batches' jobs that are in the queue or about to be, with their states."""
     queue = read_queue(list(batches))
     arrived = {name for name, _ in queue}
     for name, batch in batches.items():
-        young = time.time() - batch.get("time", 0) < SUBMITTING
-        if young and batch.get("id") is None and name not in arrived:
+        young = time.time() - batch["time"] < SUBMITTING
+        if young and batch["id"] is None and name not in arrived:
             queue |= {(name, index): "SUBMITTING" for index in range(len(batch["runs"]))}
     return queue
 
