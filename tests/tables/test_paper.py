@@ -135,3 +135,17 @@ def test_no_negative_zero_in_print():
     psnr = MEASURES["psnr"]
     assert psnr.spell(-0.001, signed=True) == "+0.00" and psnr.spell(-0.001) == "0.00"
     assert psnr.spell(-0.5, signed=True) == "-0.50" and psnr.spell(0.5, signed=True) == "+0.50"
+
+
+def test_the_project_page_differs_in_the_cells_that_are_kept():
+    """Each of its cells is one of the paper's, with another value; means are those of its rows."""
+    counts = {}
+    for name in paper.list_papers():
+        numbers = paper.load_numbers(name)
+        assert all(numbers.values[key] != value for key, value in numbers.page.items())
+        counts[name] = len(numbers.page)
+    assert {name: n for name, n in counts.items() if n} == {"main_sota": 12, "ablation_k": 2}
+    page = paper.load_numbers("main_sota").page
+    for dataset, views in (("MipNeRF360", (4, 6, 9)), ("Omni3D", (4, 6, 9)), ("ActorsHQ", (5, 8, 12))):
+        values = [page[dataset, str(n), "VaxNeRF", "baseline", "psnr_db"] for n in (*views, "mean")]
+        assert abs(sum(values[:3]) / 3 - values[3]) < 0.006

@@ -1,5 +1,8 @@
 """The paper's numbers, to stand beside ours: reads the CSV files in `paper_numbers/` and finds a cell's entry.
 
+They are those of the TeX source of arXiv 2606.20531. `project_page.csv` holds what the project page
+(tarun738.github.io/visdom, commit 11fc402 of its repository) prints otherwise.
+
 Columns: table, dataset, views, method, variant, metric, value. `views` is a number of cameras, "mean" (over the
 numbers of cameras, as printed) or "all".
 """
@@ -9,7 +12,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 
@@ -18,6 +21,7 @@ from visdom_plugin.errors import ConfigError, unknown_name
 KEYS = ("dataset", "views", "method", "variant", "metric")
 GIVEN = ("dataset", "views", "method", "variant")
 """What a row or a column of a table may say about its place in the paper."""
+_PAGE = "project_page.csv"
 _GAIN = {"psnr_db": ("psnr_gain_db", "vd_dilate_r0")}
 """A metric whose gains are printed in place of values, over the values of this variant."""
 
@@ -29,6 +33,8 @@ class Numbers:
     name: str
     values: Mapping[tuple[str, ...], float]
     """By the fields `KEYS`."""
+    page: Mapping[tuple[str, ...], float] = field(default_factory=dict)
+    """What the project page prints in place of some of them."""
 
     def find(self, **query: object) -> float | None:
         """The number with these fields (all of `KEYS`); None where the paper prints none.
@@ -61,7 +67,8 @@ class Numbers:
 
 def list_papers() -> list[str]:
     """Names of the paper's tables that are shipped."""
-    return sorted(f.name[:-4] for f in _folder().iterdir() if f.name.endswith(".csv"))
+    files = (f.name for f in _folder().iterdir())
+    return sorted(name[:-4] for name in files if name.endswith(".csv") and name != _PAGE)
 
 
 @cache
@@ -75,15 +82,19 @@ def load_numbers(name: str) -> Numbers:
     names = [part.strip() for part in name.split("+")]
     if len(names) > 1:
         values: dict[tuple[str, ...], float] = {}
-        for part in names:
-            for key, value in load_numbers(part).values.items():
+        page: dict[tuple[str, ...], float] = {}
+        for part in map(load_numbers, names):
+            page |= part.page
+            for key, value in part.values.items():
                 if values.setdefault(key, value) != value:
                     raise ConfigError(f"the paper's tables {name} contradict each other: {', '.join(key)}")
-        return Numbers(name, values)
+        return Numbers(name, values, page)
     if name not in known:
         raise unknown_name(f"the paper's numbers have no table {name!r}", name, known)
-    text = (_folder() / f"{name}.csv").read_text(encoding="utf-8")
-    return Numbers(name, read_numbers(text, name))
+    text, other = ((_folder() / file).read_text(encoding="utf-8") for file in (f"{name}.csv", _PAGE))
+    head, *lines = other.splitlines(keepends=True)
+    of_table = head + "".join(line for line in lines if line.startswith(f"{name},"))
+    return Numbers(name, read_numbers(text, name), read_numbers(of_table, _PAGE))
 
 
 def read_numbers(text: str, where: object) -> dict[tuple[str, ...], float]:

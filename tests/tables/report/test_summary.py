@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from tests.tables.report.made_up import make_results, make_spec, tables
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.tables.measures import MEASURES
+from visdom_plugin.tables.report.labels import describe_numbers
 from visdom_plugin.tables.report.layout import MEAN
 from visdom_plugin.tables.report.summary import Cell, rank_cells, sample_std, summarise
 from visdom_plugin.tables.results import Job, Outcome, Results
@@ -190,3 +191,15 @@ def test_a_number_that_a_finished_run_lacks_is_not_measured():
 def test_faults_of_the_table_file_are_named(change, said):
     with pytest.raises(ConfigError, match=said):
         summarise(make_results(replace(make_spec(), **change)))
+
+
+def test_what_the_project_page_prints_otherwise_is_said_below_the_table():
+    spec = make_spec(rows=["K = 3", "K = 2"], columns=1, paper="ablation_k", metrics=("psnr",))
+    rows = [
+        replace(row, paper={"method": "ZipNeRF", "variant": f"vd_K{k}"})
+        for row, k in zip(spec.rows, (3, 2), strict=True)
+    ]
+    spec = replace(spec, rows=tuple(rows))
+    said = [line for line in describe_numbers(spec, summarise(make_results(spec))) if "project page" in line]
+    places = "K = 3, data 0, 4 views: 24.10; K = 3, data 0, mean: 25.99"
+    assert said == [f"The paper's project page prints other numbers: {places}."]

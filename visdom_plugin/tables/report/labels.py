@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from visdom_plugin.tables.measures import MEASURES
+from visdom_plugin.tables.paper import find_number, load_numbers
 from visdom_plugin.tables.report.summary import Cell, Summary
 from visdom_plugin.tables.spec import TableSpec
 
@@ -49,6 +52,7 @@ def describe_numbers(spec: TableSpec, summary: Summary) -> list[str]:
         lines.append(f"The {marks} of {among} {verb} marked, among cells whose every run gave its number.")
     if any(c.paper is not None for c in summary.cells):
         lines.append("Beside ours: the paper's number, and ours minus the paper's in brackets.")
+        lines += _compare_with_page(spec, summary)
     if any(not c.whole and c.n for c in summary.cells):
         lines.append('"n of m": the mean of the n runs that gave a number, of m.')
     if any(c.status == "not available" for c in summary.cells):
@@ -85,3 +89,17 @@ def list_failures(spec: TableSpec, summary: Summary) -> list[tuple[str, str]]:
             place = f"{row}, {column}, {job.scene}, {job.views} views, seed {job.seed}"
             found.append((place, outcome.error or "no message"))
     return found
+
+
+def _compare_with_page(spec: TableSpec, summary: Summary) -> list[str]:
+    """One sentence on numbers that the paper's project page prints otherwise; none where it prints the same."""
+    numbers = load_numbers(spec.paper or "")
+    page = replace(numbers, values=numbers.page)
+    told = []
+    for cell in summary.cells:
+        row, column, measure = spec.rows[cell.row], spec.columns[cell.column], MEASURES[cell.measure]
+        number = find_number(page, row.paper, column.paper, cell.views, measure.paper)
+        if number is not None:
+            place = f"{row.label}, {column.label}, {cell.views if cell.views == 'mean' else f'{cell.views} views'}"
+            told.append(f"{place}: {measure.spell(number)}")
+    return [f"The paper's project page prints other numbers: {'; '.join(told)}."] if told else []
