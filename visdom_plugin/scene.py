@@ -10,12 +10,21 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras
 
-MaskOrigin = Literal["given", "missing", "hull", "colour"]
+MaskOrigin = Literal["given", "missing", "hull", "colour", "whole"]
 """given: the data has it. missing: it has none, `masks` is True everywhere and says nothing. hull: the outline
 of the other views' hull stands in for it. colour: the same outline says where the view may be trusted for
-colour, and says nothing about what is object within."""
+colour, and says nothing about what is object within. whole: no view has a mask; the photograph counts as it is."""
+
+
+NO_MASKS = (
+    "cut the object out of each photograph (rembg, SAM or an image editor) and save masks/<photograph>.png, white "
+    "on the object, or the photographs as PNG with an alpha channel; other views do not help. Variants without a "
+    "hull and a mask loss, such as method:ingp, train on the photographs as they are: --data.missing-masks colour"
+)
+"""What to do where no view has a mask."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +64,11 @@ class Views:
         """Where one view's mask comes from."""
         return self.mask_origins[index] if self.mask_origins else "given"
 
+    @property
+    def has_masks(self) -> bool:
+        """Whether the data gives a mask for any of the views."""
+        return not self.mask_origins or "given" in self.mask_origins
+
     def take(self, indices: Sequence[int]) -> Views:
         """Some of the views, in the order given."""
 
@@ -85,10 +99,20 @@ class Views:
         """What may carve: the cameras and masks of the views whose mask was given.
 
         An ignored pixel may be object for all one knows, so it counts as foreground here.
+
+        Raises:
+            SceneError: no view has a mask.
         """
         if not self.mask_origins and not self.ignore:
             return self.cameras, self.masks
         given = [i for i in range(len(self)) if self.mask_origin(i) == "given"]
+        if not given:
+            raise SceneError(
+                f"none of the {len(self)} training views has a foreground mask, and a hull is carved from masks",
+                where=", ".join(self.names[:5]),
+                cause="masks are neither in the folder masks nor in the photographs' alpha channels",
+                todo=NO_MASKS,
+            )
         ignored = [self.ignored(i) for i in given]
         masks = [
             self.masks[i] if g is None else self.masks[i] | g for i, g in zip(given, ignored, strict=True)
@@ -155,6 +179,7 @@ def describe_masks(views: Views) -> list[str]:
         "missing": "views without a mask",
         "hull": "views whose mask is the outline of the other views' hull (they do not carve)",
         "colour": "views without a mask, for colour only inside the other views' hull (no carving, no mask loss)",
+        "whole": "views without a mask, as photographed, background included",
     }
     origins = [views.mask_origin(i) for i in range(len(views))]
     lines = [f"{origins.count(kind)} {text}" for kind, text in known.items() if kind in origins]

@@ -74,7 +74,7 @@ class ViewReader:
         opacity, mask_path, remarks = side_files.read_mask(reading, file, photo, self._choose_turns)
         masked = opacity is not None
         if not masked and not reading.request.allow_missing_masks:
-            side_files.refuse_unmasked(reading, file, photo.path)
+            side_files.refuse_unmasked(reading, file, photo)
         soft = np.ones((1, 1), np.float32) if opacity is None else opacity
         image = photo.decode()
         unknown = side_files.read_ignored(reading, file, photo, self._choose_turns)
@@ -127,7 +127,7 @@ class ViewReader:
                 mask = side_files.resize(soft, *photo.target) > 0.5
                 masks.refuse_empty(mask, float(soft.max()), mask_path)
         if not masked and not missing_allowed:
-            side_files.refuse_unmasked(reading, file, photo.path)
+            side_files.refuse_unmasked(reading, file, photo)
         for relative in (file.ignore, file.excluded):
             if relative is not None:
                 side_files.open_side_file(reading, relative, photo, "mask of ignored pixels")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +12,12 @@ from torch import Tensor
 
 from datamodules.capture import Frame
 from datamodules.files import images, masks
-from datamodules.files.paths import read_file
+from datamodules.files.paths import printable, read_file
 from datamodules.views import orientation
+from datamodules.views.find_files import loose_key
 from datamodules.views.photograph_files import Photograph, Reading
-from visdom_plugin.errors import SceneError
+from visdom_plugin.errors import SceneError, list_some
+from visdom_plugin.scene import NO_MASKS
 
 ChooseTurns = Callable[[], tuple[int, bool]]
 """For files that fit their photograph turned and not: which way most do, and whether that is clear."""
@@ -86,25 +88,45 @@ def resize(soft: np.ndarray, width: int, height: int) -> np.ndarray:
     return images.shrink_nearest(soft, width, height)
 
 
-def refuse_unmasked(reading: Reading, file: Frame, path: Path) -> None:
+def refuse_unmasked(reading: Reading, file: Frame, photo: Photograph) -> None:
     """Raises SceneError about a view that has no mask, with what there is in its place."""
     if file.ignore is not None:
         raise SceneError(
             f"the photograph has no foreground mask: {file.ignore} says which pixels to ignore",
-            where=path,
+            where=photo.path,
             cause="mask_path has nerfstudio's meaning here",
             todo="pass --mask-path foreground if these files are white on the object",
         )
-    folder = reading.mask_folder
-    missing = folder is not None and not (reading.root / folder).is_dir()
+    source, folder = reading.request.mask_source, reading.request.masks or reading.mask_folder
+    lacks, missing = [], folder is not None and not (reading.root / folder).is_dir()
+    if source != "alpha" and folder is not None:
+        lacks.append(
+            f"there is no folder {folder}" if missing else f"there is no file of its name in {folder}"
+        )
+    if source != "folder":
+        lacks.append("its alpha channel is opaque everywhere" if photo.alpha else "it has no alpha channel")
+    others = _other_folders(reading.root, file)
     raise SceneError(
-        f"the folder {folder} is missing" if missing else "the photograph has no mask",
-        where=reading.root if missing else path,
-        cause="and the photographs have no alpha channel to take its place" if missing else None,
-        todo="put one PNG per image there, white on the object, named like the image"
-        if folder is not None
-        else "save the photographs as PNG with an alpha channel that is opaque on the object",
+        f"the photograph {printable(file.name)} has no foreground mask: {', and '.join(lacks)}",
+        where=reading.root if missing else photo.path,
+        cause=f"masks in another folder: {list_some(others)} has a file of this name" if others else None,
+        todo=f"pass --masks {others[0]} if its files are white (or opaque) on the object"
+        if others
+        else NO_MASKS,
     )
+
+
+def _other_folders(root: Path, file: Frame) -> list[str]:
+    """Folders beside the photographs' that hold a picture of a photograph's name and could hold masks."""
+    name = loose_key(PurePosixPath(file.image).name)
+    known = ("images", "depth", "normal", "ignore", "sparse")
+    folders = [p for p in sorted(root.iterdir()) if p.is_dir() and not p.name.lower().startswith(known)]
+    return [
+        folder.name
+        for folder in folders
+        if folder.name != PurePosixPath(file.image).parts[0]
+        and any(loose_key(p.name) == name for p in folder.iterdir() if p.suffix.lower() in images.ENDINGS)
+    ]
 
 
 class SideFile(NamedTuple):

@@ -11,7 +11,7 @@ import torch
 
 from tests.hull.balls import ball_masks, ring
 from tests.training import fake
-from visdom_plugin.cli.commands import evaluate, hull, train
+from visdom_plugin.cli.commands import check, evaluate, hull, train
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
@@ -175,3 +175,14 @@ def test_the_options_of_a_file_and_of_the_command_line_agree(fakes, capsys):
     Path("my.yaml").write_text(text)
     assert train.main(["--config", "my.yaml", "--show-config"]) == 0
     assert capsys.readouterr().out == text
+
+
+@pytest.mark.parametrize("command", ["check", "hull"])
+def test_no_mask_at_all_is_said_in_the_commands_terms(scene, command, capsys):
+    made = scene["scene"]
+    scene["scene"] = replace(made, train=replace(made.train, mask_origins=("missing",) * 4))
+    main = {"check": check.main, "hull": hull.main}[command]
+    assert main(["somewhere", "--data.missing-masks", "colour", "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert "none of the 4 training views has a foreground mask" in said and "masks/<photograph>.png" in said
+    assert "--views" not in said and "cameras[None]" not in said

@@ -179,3 +179,21 @@ def test_a_view_for_colour_only_is_better_than_none(whole):
         for name, scene in (("colour", coloured), ("left out", left_out))
     }
     assert scores["colour"] > scores["left out"]
+
+
+def test_without_any_mask_all_commands_say_how_to_make_some(whole):
+    nothing = replace(whole, train=strip(whole.train, range(5)), test=strip(whole.test, range(4)))
+    with pytest.raises(
+        SceneError, match=r"none of the 5 training views has a foreground mask[\s\S]*masks/<ph"
+    ):
+        nothing.train.silhouettes()
+    with pytest.raises(SceneError, match=r"only 0 training views have one: a hull needs two"):
+        fill_masks(nothing, "hull")
+
+
+def test_without_any_mask_photographs_are_trained_on_as_they_are(whole, caplog):
+    nothing = replace(whole, train=strip(whole.train, range(5)), test=strip(whole.test, range(4)))
+    filled = fill_masks(nothing, "colour").train
+    assert not filled.has_masks and set(filled.mask_origins) == {"whole"} and "as they are" in caplog.text
+    batch = DataManager(filled, 0).view(2)
+    assert batch.mask_known and bool((batch.mask == 1).all()) and batch.weight is None

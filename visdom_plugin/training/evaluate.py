@@ -118,10 +118,12 @@ def render_on_white(method: Renderer, camera: Cameras, device: torch.device) -> 
 def carve_reference(views: Views, domain: Any = None) -> Any | None:
     """The hull that `outside_hull_mass` is measured against: the default visible domain of these views.
 
-    The same for every method and variant. None, with a warning, when it is empty.
+    The same for every method and variant. None, with a warning, when it is empty, and when no view has a mask.
     """
     from visdom_plugin.hull.domain import VisibleDomain
 
+    if not views.has_masks:
+        return None
     try:
         return (domain or VisibleDomain()).carve(*views.silhouettes())
     except EmptyHullError as error:

@@ -4,6 +4,7 @@ The outline of that hull, seen by the view, holds the object wherever the other 
 of the background beside it. With `hull` it is the view's mask. With `colour`, pixels outside the outline are
 ignored; inside, only colour is supervised and opacity is free (`losses.composite_target`), without a mask loss.
 In neither case does the view carve: its outline comes from the others and would count their votes twice.
+Where no view has a mask, `colour` takes the photographs as a whole, background included.
 
 Nothing stands in for the mask of a test view: a render measured against the hull's outline would be praised for
 filling the hull. Such a view is rendered and not measured.
@@ -22,7 +23,7 @@ from torch import Tensor
 from visdom_plugin.errors import SceneError, list_some
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
-from visdom_plugin.scene import MaskOrigin, Scene, Views
+from visdom_plugin.scene import NO_MASKS, MaskOrigin, Scene, Views
 
 log = logging.getLogger(__name__)
 
@@ -64,12 +65,17 @@ def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> S
         )  # fmt: skip
     if not missing:
         return scene
+    if not given and way == "colour":
+        log.warning(
+            "no training view has a mask: photographs are trained on as they are, background included"
+        )
+        return replace(scene, train=replace(scene.train, mask_origins=("whole",) * len(missing)))
     if given < 2:
         raise SceneError(
             f"{len(missing)} training views have no mask: {list_some([scene.train.names[i] for i in missing])}",
             where=scene.name,
             cause=f"and only {given} training views have one: a hull needs two",
-            todo="make masks for them",
+            todo="make masks for them" if given else NO_MASKS,
         )
     domain = VisibleDomain(k=min(3, given)) if domain is None else domain
     outlines = outline_views(domain.carve(*scene.train.silhouettes()), scene.train, missing)

@@ -85,7 +85,7 @@ FAULTS = {
         lambda f: (f / "images").rename(f / "images_2"),
         ["folder images is missing", "--downscale 2"],
     ),
-    "no masks folder": (lambda f: shutil.rmtree(f / "masks"), ["folder masks is missing"]),
+    "no masks folder": (lambda f: shutil.rmtree(f / "masks"), ["no folder masks", "no alpha channel", "rembg"]),
     "no training list": (lambda f: (f / "sparse_4.txt").unlink(), ["no sparse_<N>.txt"]),
     "no test list": (lambda f: (f / "sparse_test.txt").unlink(), ["sparse_test.txt is missing"]),
     "missing mask": (lambda f: (f / "masks/train_002.png").unlink(), ["train_002", "no mask"]),

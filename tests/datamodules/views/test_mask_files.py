@@ -4,6 +4,7 @@ import json
 import logging
 from dataclasses import replace
 
+import cv2
 import pytest
 import torch
 
@@ -111,3 +112,21 @@ def test_missing_masks_beside_stray_ones_are_not_called_shifted(views, tmp_path,
         (folder / "masks/train_999.png").write_bytes((folder / "masks/train_001.png").read_bytes())
         assert len(load(folder, train_list="1,2", test=False).train) == 2
     assert "shifted" not in caplog.text
+
+
+def test_the_folder_that_may_hold_the_masks_is_named(views, tmp_path):
+    folder = w.write_colmap(views, tmp_path / "s")
+    (folder / "masks").rename(folder / "cut_outs")
+    with pytest.raises(SceneError, match=r"no folder masks, and it has no alpha[\s\S]*pass --masks cut_outs"):
+        load(folder, views=7)
+    assert len(load(folder, views=7, masks="cut_outs").train.masks) == 7
+
+
+def test_an_opaque_alpha_channel_is_not_called_absent(views, tmp_path):
+    folder = w.write_nerfstudio(views, tmp_path / "s", alpha=True)
+    for path in (folder / "images").iterdir():
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        pixels[..., 3] = 255
+        cv2.imwrite(str(path), pixels)
+    with pytest.raises(SceneError, match="no folder masks, and its alpha channel is opaque everywhere"):
+        load(folder, views=7)

@@ -92,6 +92,8 @@ def warn_of_faults(scene: Scene) -> None:
     import logging
 
     log = logging.getLogger(__name__)
+    if not scene.train.has_masks:
+        return
     views, masks = carving_views(scene.train)
     for f in check_views(views, masks, brief=True, layout=scene.source.get("layout")).findings:
         log.warning("%s (%s); what to do: %s; `visdom-check` tells more", f.what, f.sure, f.todo)
