@@ -69,7 +69,8 @@ def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> S
         log.warning(
             "no training view has a mask: photographs are trained on as they are, background included"
         )
-        return replace(scene, train=replace(scene.train, mask_origins=("whole",) * len(missing)))
+        whole: list[MaskOrigin] = ["whole"] * len(missing)
+        return replace(scene, train=replace(scene.train, mask_origins=whole))
     if given < 2:
         raise SceneError(
             f"{len(missing)} training views have no mask: {list_some([scene.train.names[i] for i in missing])}",
