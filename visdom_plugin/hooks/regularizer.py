@@ -20,6 +20,7 @@ from visdom_plugin.hooks.settings import RegularizerSettings
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.point_colours import check_images, colour_points
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
+from visdom_plugin.hull.queries.shell_points import sample_shell
 from visdom_plugin.losses import below_one
 
 log = logging.getLogger(__name__)
@@ -143,7 +144,7 @@ class VisDomGaussianRegularizer:
             and c.every >= 1
             and c.views_per_step >= 1
             and c.bank >= 0
-            and c.points in ("surface", "volume")
+            and c.points in ("surface", "volume", "shell")
             and c.prune_every >= 0
             and 0 <= c.prune_margin_voxels < math.inf
         ):
@@ -151,7 +152,7 @@ class VisDomGaussianRegularizer:
                 f"weight={c.weight}, every={c.every}, views_per_step={c.views_per_step}, bank={c.bank}, "
                 f"points={c.points!r}, prune_every={c.prune_every}, prune_margin_voxels={c.prune_margin_voxels}: "
                 "weight, bank, prune_every and prune_margin_voxels must be >= 0, every and views_per_step >= 1, "
-                "points 'surface' or 'volume'",
+                "points 'surface', 'volume' or 'shell'",
                 where="VisDomGaussianRegularizer",
             )
         self.hull, self.cameras = hull, cameras.to("cpu")
@@ -171,8 +172,8 @@ class VisDomGaussianRegularizer:
         float64. Trainers in float32 want `hull.relative_to(origin)` and `cameras.relative_to(origin)` there.
         """
         shape = self.hull.inner or self.hull
-        draw = shape.sample_points if self.config.points == "surface" else shape.sample_inside
-        xyz = draw(n, generator)
+        draw = {"surface": Hull.sample_points, "volume": Hull.sample_inside, "shell": sample_shell}
+        xyz = draw[self.config.points](shape, n, generator)
         if is_near(self.hull.extent, float(np.ptp(self.hull.extent, axis=0).max())):
             xyz = xyz.float()
         if self.images is None:

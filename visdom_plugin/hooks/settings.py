@@ -42,8 +42,9 @@ class RegularizerSettings:
     bank: int = 64
     """Views to draw from, made once, so that the hull's silhouette is cast once for each; 0 draws a new view
     every time."""
-    points: Literal["surface", "volume"] = "volume"
-    """Where initial points lie: on the hull's surface, or anywhere inside it, where the object is."""
+    points: Literal["surface", "volume", "shell"] = "volume"
+    """Where initial points lie: on the hull's surface; anywhere inside it, where the object is; or inside it, most
+    of them near the surface, so that thin parts have enough."""
     prune_every: int = 50
     """Remove Gaussians whose centres lie outside the hull on every n-th step; 0 leaves them to L_i."""
     prune_margin_voxels: float = 2.0
