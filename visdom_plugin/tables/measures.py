@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from visdom_plugin.errors import unknown_name
 
@@ -33,9 +32,9 @@ class Measure:
         """Which way is better."""
         return "↑" if self.higher_is_better else "↓"
 
-    def read(self, record: Mapping[str, Any] | None) -> float | None:
+    def read(self, record: Mapping[str, object] | None) -> float | None:
         """The number in a run's record, in the printed unit; None where the run has none."""
-        value: Any = record
+        value: object = record
         for key in self.path:
             value = value.get(key) if isinstance(value, Mapping) else None
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):

@@ -13,11 +13,11 @@ from typing import Any
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.tables.results import Results
 
-Fact = tuple[str, Any, str]
+Fact = tuple[str, object, str]
 """Name, value, and whose it is, e.g. ("hull.k", 3, "row 'INGP'")."""
 
 
-def facts_of_settings(config: Mapping[str, Any], kind: str) -> dict[str, Any]:
+def facts_of_settings(config: Mapping[str, Any], kind: str) -> dict[str, object]:
     """Facts of one row's resolved settings (plain data); those that do not apply are left out."""
     if kind == "hull":
         hull = config.get("hull", config)
@@ -32,7 +32,7 @@ def facts_of_settings(config: Mapping[str, Any], kind: str) -> dict[str, Any]:
     return facts
 
 
-def facts_of_record(record: Mapping[str, Any]) -> dict[str, Any]:
+def facts_of_record(record: Mapping[str, Any]) -> dict[str, object]:
     """Facts of one run.json. Runs that do not note a fact count as one more value, never as agreeing."""
     protocol = (record.get("metrics") or {}).get("protocol") or {}
     return {
@@ -47,7 +47,7 @@ def refuse_mixture(
 ) -> None:
     """Raises ConfigError where one fact has two values and `varies` does not name it."""
     allowed = set(varies)
-    seen: dict[str, tuple[Any, str]] = {}
+    seen: dict[str, tuple[object, str]] = {}
     for name, value, owner in facts:
         first, first_owner = seen.setdefault(name, (value, owner))
         if first != value and name not in allowed:
@@ -82,6 +82,6 @@ def check_records(results: Results) -> None:
         refuse_mixture(facts, spec.varies, spec.source, scope)
 
 
-def _spell(value: Any) -> str:
+def _spell(value: object) -> str:
     text = "not noted" if value is None else repr(value)
     return text if len(text) <= 160 else text[:157] + "..."

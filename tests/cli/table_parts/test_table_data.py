@@ -135,6 +135,7 @@ def test_what_a_reading_may_hold_reaches_the_run():
         "masks": "outlines",
         "mask_path": "foreground",
         "allow_outside": True,
+        "split": "visdom",
     }
     assert tidy_reading(given, "here") == given and set(given) | set(OWN) == set(READING)
     with pytest.raises(ConfigError, match=r"reading\.frame cannot be 'first'"):

@@ -14,11 +14,16 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from visdom_plugin.cli import options
 from visdom_plugin.cli.early import WORD, read_early
 from visdom_plugin.errors import ConfigError, EmptyHullError, SceneError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from visdom_plugin.scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +40,37 @@ COLUMNS = (
 FAILURES = 1
 """Exit status when a run failed."""
 PROG = "visdom-eval --leave-one-out"
+
+
+class Worst(TypedDict):
+    """The worst view of a metric."""
+
+    view: str
+    value: float
+
+
+class Averages(TypedDict):
+    """What the folds come to; None where no view has a metric."""
+
+    mean: dict[str, float | None]
+    worst: dict[str, Worst | None]
+    per_view: dict[str, dict[str, float | None]]
+
+
+class Summary(Averages):
+    """leave_one_out.json's content."""
+
+    method: str
+    scene: str
+    seed: int
+    budget: str
+    views: list[str]
+    """The views held out."""
+    config: dict[str, object]
+    runs: dict[str, str]
+    """View to the run directory without it."""
+    failed: dict[str, str]
+    """View to why the run without it failed."""
 
 
 def leave_one_out(argv: Sequence[str]) -> int:
@@ -67,19 +103,19 @@ def leave_one_out(argv: Sequence[str]) -> int:
     return FAILURES if summary["failed"] else 0
 
 
-def default_folder(scene: Any, method: str, seed: int) -> Path:
+def default_folder(scene: Scene, method: str, seed: int) -> Path:
     """runs/<scene>/<views>/<method>/<seed>-leave-one-out."""
     from visdom_plugin.cli.runs import default_run_dir
 
     return default_run_dir(scene.name, len(scene.train), method, seed).with_name(f"{seed}-leave-one-out")
 
 
-def held_out_views(scene: Any) -> list[int]:
+def held_out_views(scene: Scene) -> list[int]:
     """Positions of the training views that can be measured on: those whose mask was given."""
     return [i for i in range(len(scene.train)) if scene.train.mask_origin(i) == "given"]
 
 
-def check_views(scene: Any, config: Any) -> None:
+def check_views(scene: Scene, config: object) -> None:
     """Refuses scenes and hulls that leave nothing once a view is held out; hints where little is left.
 
     Raises:
@@ -112,7 +148,7 @@ def check_views(scene: Any, config: Any) -> None:
         )  # fmt: skip
 
 
-def run_folds(request: options.Request, scene: Any, folder: Path, *, device: str) -> dict[str, Any]:
+def run_folds(request: options.Request, scene: Scene, folder: Path, *, device: str) -> Summary:
     """Makes, or finds, the run without each view, and writes what they come to.
 
     A run that fails does not stop the others: what its training diverged on, or what its hull was empty of, may be
@@ -158,7 +194,7 @@ def run_folds(request: options.Request, scene: Any, folder: Path, *, device: str
         columns.append(_column(fold, records[name], folder / names[i]))
     if columns:
         write_png(folder / "leave_one_out.png", _draw(columns))
-    summary = {
+    summary: Summary = {
         "method": request.preset.name,
         "scene": scene.name,
         "seed": common.seed,
@@ -173,16 +209,12 @@ def run_folds(request: options.Request, scene: Any, folder: Path, *, device: str
     return summary
 
 
-def summarise(per_view: dict[str, dict[str, float | None]]) -> dict[str, Any]:
-    """Mean and worst view of each metric; None where no view has it.
-
-    Returns:
-        {"mean": {metric: value}, "worst": {metric: {"view", "value"}}, "per_view": as given}.
-    """
+def summarise(per_view: dict[str, dict[str, float | None]]) -> Averages:
+    """Mean and worst view of each metric; None where no view has it."""
     from visdom_plugin.training.metrics import NAMES
 
-    mean: dict[str, Any] = {}
-    worst: dict[str, Any] = {}
+    mean: dict[str, float | None] = {}
+    worst: dict[str, Worst | None] = {}
     for name in NAMES:
         values = {view: value for view, row in per_view.items() if (value := row.get(name)) is not None}
         mean[name] = sum(values.values()) / len(values) if values else None
@@ -192,7 +224,7 @@ def summarise(per_view: dict[str, dict[str, float | None]]) -> dict[str, Any]:
     return {"mean": mean, "worst": worst, "per_view": per_view}
 
 
-def show_summary(summary: dict[str, Any], folder: Path) -> None:
+def show_summary(summary: Summary, folder: Path) -> None:
     """The table on the terminal."""
     from rich.console import Console
     from rich.table import Table
@@ -223,7 +255,7 @@ def show_summary(summary: dict[str, Any], folder: Path) -> None:
             console.print(f"{label:>8}: {folder / name}", highlight=False, markup=False)
 
 
-def _column(fold: Any, record: dict[str, Any], run_dir: Path) -> tuple[str, list[Any]]:
+def _column(fold: Scene, record: dict[str, Any], run_dir: Path) -> tuple[str, list[np.ndarray]]:
     """Title, truth, render and error of a run's one test view."""
     from visdom_plugin.figures.contact_sheet import draw_error, picture_names, read_png, to_bytes
     from visdom_plugin.training.metrics import whiten
@@ -239,7 +271,7 @@ def _column(fold: Any, record: dict[str, Any], run_dir: Path) -> tuple[str, list
     return f"{name}  {psnr:.1f} dB", [truth, render, error]
 
 
-def _draw(columns: list[tuple[str, list[Any]]]) -> Any:
+def _draw(columns: list[tuple[str, list[np.ndarray]]]) -> np.ndarray:
     from visdom_plugin.figures.contact_sheet import draw_sheet
 
     return draw_sheet(columns, ["truth", "render", "error"])

@@ -6,15 +6,17 @@ table files, and ablation.png: a row per variant, with its renders of a few view
 
 from __future__ import annotations
 
-import logging
+import hashlib
+import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import tyro
 
+from visdom_plugin import registry
 from visdom_plugin.cli.early import WORD, read_early
 from visdom_plugin.cli.options import Common, Request, choose_budget, name_method, resolve_device
 from visdom_plugin.cli.table_parts.run_table import (
@@ -26,16 +28,15 @@ from visdom_plugin.cli.table_parts.run_table import (
 )
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.tables.results import Job, Outcome, Results
-from visdom_plugin.tables.spec import Column, Row, TableSpec, flatten, nest
+from visdom_plugin.tables.spec import Column, Row, Settings, TableSpec, flatten, nest
+from visdom_plugin.training.runs.config_io import as_plain, from_plain
 
 if TYPE_CHECKING:
     from visdom_plugin.scene import Scene, Views
 
-log = logging.getLogger(__name__)
-
 NAME = "ablation"
 DEFAULT_METHOD = "ingp"
-VARIANTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+VARIANTS: tuple[tuple[str, str, Settings], ...] = (
     ("vanilla", "", {}),
     ("+mask", "+mask", {}),
     ("+unit sphere", "+vd", {"hull.kind": "unit-sphere"}),
@@ -103,8 +104,6 @@ def make_spec(method: str, options: AblationOptions) -> TableSpec:
         ConfigError: for a method without the variants +mask and +vd, a setting that is not PATH=VALUE, and one
             that would make a variant something else than its label says.
     """
-    from visdom_plugin import registry
-
     base = registry.find(method).name
     known = registry.installed().presets
     missing = [base + suffix for suffix in ("+mask", "+vd") if base + suffix not in known]
@@ -130,10 +129,10 @@ def make_spec(method: str, options: AblationOptions) -> TableSpec:
     return change_spec(spec, options)
 
 
-def _read_settings(words: Sequence[str]) -> dict[str, Any]:
+def _read_settings(words: Sequence[str]) -> Settings:
     import yaml
 
-    found: dict[str, Any] = {}
+    found: Settings = {}
     for word in words:
         path, equals, value = word.partition("=")
         if not (path and equals and value):
@@ -153,7 +152,7 @@ def _read_settings(words: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def _fitting(row: Row, preset: Any) -> dict[str, Any]:
+def _fitting(row: Row, preset: registry.Preset) -> Settings:
     bare = getattr(preset.quick, "hull", None) is None
     return {k: v for k, v in row.settings.items() if not (bare and k.startswith("hull."))}
 
@@ -162,11 +161,15 @@ def _open(spec: TableSpec, options: AblationOptions) -> Scene:
     """The scene whose views the figure shows: at the first number of views, with the first seed."""
     from visdom_plugin.cli.scenes import open_scene
 
-    column = spec.columns[0]
-    asked: dict[str, Any] = {"views": column.views[0], "downscale": column.downscale, "seed": spec.seeds[0]}
-    if options.leave_one_out:
-        asked |= {"fill": False, "hold_out": False}
-    return open_scene(options.data, **asked)
+    column, folds = spec.columns[0], options.leave_one_out
+    return open_scene(
+        options.data,
+        views=column.views[0],
+        downscale=column.downscale,
+        seed=spec.seeds[0],
+        fill=not folds,
+        hold_out=not folds,
+    )
 
 
 def _run_folds(spec: TableSpec, scene: Scene, options: AblationOptions, out: Path, runs: Path) -> int:
@@ -193,7 +196,7 @@ def _run_folds(spec: TableSpec, scene: Scene, options: AblationOptions, out: Pat
         quiet=options.quiet,
     )
     device = resolve_device(options.device)
-    requests = [_request(row, budget, common, note, Request) for row in spec.rows]
+    requests = [_request(row, budget, common, note) for row in spec.rows]
     for request in requests:
         folds.check_views(scene, request.config)
     names = tuple(scene.train.names[i] for i in folds.held_out_views(scene))
@@ -201,17 +204,18 @@ def _run_folds(spec: TableSpec, scene: Scene, options: AblationOptions, out: Pat
     outcomes: dict[Job, Outcome] = {}
     for i, (row, request) in enumerate(zip(spec.rows, requests, strict=True)):
         folder = runs / _name_of(row, request)
-        summary: dict[str, Any] = {"runs": {}, "failed": {}}
+        runs_of, failed = {}, {}
         if only is None or i in only:
             if not options.quiet:
                 say(f"{row.label}: {row.method}")
             summary = folds.run_folds(request, scene, folder, device=device)
+            runs_of, failed = summary["runs"], summary["failed"]
         for name in names:
-            run_dir = folder / summary["runs"].get(name, "")
+            run_dir = folder / runs_of.get(name, "")
             outcome = Outcome("waiting")
-            if name in summary["failed"]:
-                outcome = Outcome("failed", error=summary["failed"][name])
-            elif name in summary["runs"]:
+            if name in failed:
+                outcome = Outcome("failed", error=failed[name])
+            elif name in runs_of:
                 outcome = Outcome("finished", record=read_record(run_dir))
             outcomes[Job(i, 0, name, column.views[0], spec.seeds[0], run_dir)] = outcome
     results = Results(spec, outcomes)
@@ -222,27 +226,19 @@ def _run_folds(spec: TableSpec, scene: Scene, options: AblationOptions, out: Pat
     return 1 if any(o.status == "failed" for o in outcomes.values()) else 0
 
 
-def _name_of(row: Row, request: Any) -> str:
+def _name_of(row: Row, request: Request) -> str:
     """A folder for the row's runs; another one for other settings."""
-    import hashlib
-    import json
-
-    from visdom_plugin.training.runs.config_io import as_plain
-
     common = as_plain(request.common)
     identity = [as_plain(request.config), *(common[k] for k in ("data", "views", "downscale", "seed"))]
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
     return f"{row.method}-{row.label.strip('+').replace(' ', '-')}-without-one-{digest[:12]}"
 
 
-def _request(row: Row, budget: str, common: Any, note: str, make: Any) -> Any:
-    from visdom_plugin import registry
-    from visdom_plugin.training.runs.config_io import from_plain
-
+def _request(row: Row, budget: str, common: Common, note: str) -> Request:
     preset = registry.find(row.method)
     where = f"row {row.label!r}"
     config = from_plain(getattr(preset, budget), nest(row.settings, where), where)
-    return make(preset, config, common, note)
+    return Request(preset, config, common, note)
 
 
 def _draw(results: Results, views: int, photographs: Views, out: Path, quiet: bool) -> None:

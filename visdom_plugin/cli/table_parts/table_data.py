@@ -12,13 +12,14 @@ from typing import Any
 
 from visdom_plugin.cli.options import READING, Common, resolve_lists
 from visdom_plugin.errors import ConfigError, SceneError
+from visdom_plugin.tables.spec import Settings
 from visdom_plugin.training.runs.config_io import from_plain
 
 OWN = ("views", "downscale", "seed", "data_format")
 """How a scene is read that a table says in places of their own, not in a column's `reading`."""
 
 
-def tidy_reading(reading: Mapping[str, Any], where: str) -> dict[str, Any]:
+def tidy_reading(reading: Settings, where: str) -> Settings:
     """A column's `reading`, checked; index files by their full path.
 
     Raises:
@@ -44,7 +45,7 @@ class DataHasher:
         self._files: dict[Path, str] = {}
         self._found: dict[str, Any] = {}
 
-    def __call__(self, kind: str, folder: Path | None, reading: Mapping[str, Any], settings: Any) -> str:
+    def __call__(self, kind: str, folder: Path | None, reading: Settings, settings: object) -> str:
         """A hash of the files that one job reads.
 
         Args:
@@ -65,6 +66,9 @@ class DataHasher:
         if kind == "hull":
             from datamodules.fingerprint import hash_file
             from visdom_plugin.cli.hulls.measure_hull import find_target
+            from visdom_plugin.training.hull_run.config import HullRunConfig
+
+            assert isinstance(settings, HullRunConfig)
 
             path = find_target(folder, settings.target, found and found.frame)
             if path is not None:

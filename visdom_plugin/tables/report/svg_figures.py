@@ -95,7 +95,7 @@ def draw_spread(rows: tuple[Dots, ...], measure: Measure) -> str:
     """Each row's seeds as dots, their mean as a bar, the paper's number as a hollow diamond."""
     with drawing():
         figure, axes = _make_axes(20 * len(rows) + 40, left=180, grid="x")
-        mark: dict[str, Any] = {"linestyle": "none", "clip_on": False}
+        mark: Any = {"linestyle": "none", "clip_on": False}
         for y, row in enumerate(rows):
             tip = f"{TIP}{printable(row.label)}: "
             if row.paper is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from visdom_plugin.tables.measures import MEASURES
 from visdom_plugin.tables.report.layout import spell_views
@@ -56,9 +56,9 @@ def _template() -> Template:
     return make_environment().get_template("table.html")
 
 
-def _place(spec: TableSpec, summary: Summary, c: int, views: int, height_px: int) -> dict[str, Any]:
+def _place(spec: TableSpec, summary: Summary, c: int, views: int, height_px: int) -> dict[str, object]:
     """Everything behind one column and number of views; parts that have nothing to show are empty."""
-    place: dict[str, Any] = {
+    place: dict[str, object] = {
         "title": f"{spec.columns[c].label}, {spell_views(views)}",
         "spreads": [s for m in spec.metrics if (s := _spread(spec, summary, c, views, m))],
         "curves": "",
@@ -76,10 +76,8 @@ def _place(spec: TableSpec, summary: Summary, c: int, views: int, height_px: int
     return place
 
 
-def _spread(spec: TableSpec, summary: Summary, c: int, views: int, measure: str) -> tuple[str, Any] | None:
+def _spread(spec: TableSpec, summary: Summary, c: int, views: int, measure: str) -> tuple[str, str] | None:
     """Title and SVG; None without any number."""
-    from markupsafe import Markup
-
     rows = []
     for r, row in enumerate(spec.rows):
         cell = summary.cell(r, c, views, measure)
@@ -89,16 +87,14 @@ def _spread(spec: TableSpec, summary: Summary, c: int, views: int, measure: str)
         return None
     paper = ", paper (diamond)" if any(dots.paper is not None for dots in rows) else ""
     title = f"{MEASURES[measure].title}: seeds (dots), mean (bar){paper}"
-    return title, Markup(draw_spread(tuple(rows), MEASURES[measure]))
+    return title, draw_spread(tuple(rows), MEASURES[measure])
 
 
-def _curves(spec: TableSpec, done: Sequence[Sequence[Finished]]) -> tuple[Any, list[tuple[str, str, str]]]:
+def _curves(spec: TableSpec, done: Sequence[Sequence[Finished]]) -> tuple[str, list[tuple[str, str, str]]]:
     """SVG, and colour, dashes and label of each line; empty where no run has a log."""
-    from markupsafe import Markup
-
     found = [[x for _, run_dir, _ in runs if (x := read_curve(run_dir)) is not None] for runs in done]
     series = [(r, spec.rows[r].label, average_curves(curves)) for r, curves in enumerate(found) if curves]
-    return Markup(draw_curves(series) if series else ""), [(*pen(r), label) for r, label, _ in series]
+    return draw_curves(series) if series else "", [(*pen(r), label) for r, label, _ in series]
 
 
 def _strips(spec: TableSpec, c: int, done: Sequence[Sequence[Finished]], height_px: int) -> list[tuple]:

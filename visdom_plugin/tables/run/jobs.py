@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from visdom_plugin.atomic_files import write_bytes
 from visdom_plugin.errors import ConfigError, SceneError, list_some
@@ -36,7 +35,7 @@ class Resolved:
     """The method's own name, aliases resolved."""
     budget: str
     """quick or full."""
-    config: Any
+    config: object
     """Settings dataclass of that budget."""
 
 

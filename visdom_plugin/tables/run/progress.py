@@ -8,11 +8,14 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from visdom_plugin.tables.results import Outcome
 from visdom_plugin.tables.run.job_files import read_step
 from visdom_plugin.tables.run.jobs import Task
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 EVERY = 30.0
 """Seconds between two lines where there is no terminal."""
@@ -28,7 +31,7 @@ class Overview:
         """
         self.quiet = quiet
         self.stream = sys.stderr if stream is None else stream
-        self._bar: Any = None
+        self._bar: Progress | None = None
         self._tasks: Mapping[Path, Task] = {}
         self._known: Mapping[Path, Outcome] = {}
         self._shown = 0.0
@@ -53,7 +56,7 @@ class Overview:
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-            self._bar = Progress(
+            self._bar = bar = Progress(
                 TextColumn("jobs"),
                 BarColumn(),
                 TextColumn("{task.fields[note]}"),
@@ -61,8 +64,8 @@ class Overview:
                 console=Console(file=self.stream),
                 refresh_per_second=4,
             )
-            self._bar.start()
-            self._line = self._bar.add_task("", total=1.0, note="")
+            bar.start()
+            self._line = bar.add_task("", total=1.0, note="")
         failed = f", {counts['failed']} failed before" if counts["failed"] else ""
         self._say(
             f"{len(tasks)} run{'s' * (len(tasks) != 1)} in all, {counts['finished']} of them done before{failed}, "
