@@ -72,7 +72,7 @@ def _place(spec: TableSpec, summary: Summary, c: int, views: int, height_px: int
         place["curves"], place["legend"] = _curves(spec, done)
         place["strips"] = _strips(spec, c, done, height_px)
     if len(spec.columns[c].scenes) * len(spec.seeds) > 1:
-        place["scenes"] = [s for m in spec.metrics if (s := _scenes(spec, summary, c, views, m))]
+        place["scenes"] = [t for m in spec.metrics if (t := _scenes(spec, summary, c, views, m))]
     return place
 
 
