@@ -35,6 +35,8 @@ class Request:
     are, they must agree."""
     masks: str | None = None
     """Folder of the foreground masks, below the scene's; None takes the layout's, or one that is called alike."""
+    colmap_model: str | None = None
+    """Folder of the COLMAP model below the scene's, such as sparse/1; None takes the one with most photographs."""
     mask_path: Literal["ignore", "foreground"] = "ignore"
     """What the files named by `mask_path` in a transforms.json mean: black pixels are to be ignored, which is
     nerfstudio's meaning, or white pixels are the object."""

@@ -31,7 +31,6 @@ MODELS = {
     12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4),
     16: ("EUCM", 6), 17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
-FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}
 """Of the models that can be undistorted, those whose parameters begin f, cx, cy and not fx, fy, cx, cy."""
 _T = TypeVar("_T")
@@ -70,15 +69,6 @@ class Model:
     images: tuple[Registered, ...]
     files: tuple[str, ...] = ()
     """What it was read from, below the scene's folder."""
-
-
-def find_model(root: Path) -> str | None:
-    """The folder below `root`, "" for itself, that holds a model's cameras and images files."""
-    for folder in ("sparse/0", "sparse", "colmap/sparse/0", "colmap_sparse/0", "dense/sparse", ""):
-        start = f"{folder}/" if folder else ""
-        if any((root / f"{start}{name}").exists() for name in FILES):
-            return folder
-    return None
 
 
 def read_model(root: Path, folder: str, *, outside: bool = False) -> Model:

@@ -1,6 +1,7 @@
 """Folders with a COLMAP model in general, and what all layouts with such a model share.
 
-sparse/0, sparse, colmap/sparse/0, dense/sparse or the folder itself   the model, text or binary
+sparse/<n>, sparse, colmap/sparse/<n>, dense/sparse, sparse_<N>/<n> or the folder itself
+                                        the model, text or binary; of several, the one with most photographs
 images/ or images_<F>/                  photographs, F times smaller in the latter
 masks/                                  foreground masks, named after the photographs; or alpha channels
 
@@ -10,21 +11,25 @@ or lists say otherwise.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
 from datamodules.capture import Calibration, Capture, Frame, sort_frames
 from datamodules.files import colmap_model
 from datamodules.files.colmap_points import find_points
+from datamodules.files.find_model import choose_model, find_model
 from datamodules.files.paths import check_name, stem
 from datamodules.request import Request
 from datamodules.views import splits
 from visdom_plugin.errors import SceneError
 
+log = logging.getLogger(__name__)
+
 
 def recognise(root: Path) -> str | None:
     """What makes the folder look like this layout, or None."""
-    folder = colmap_model.find_model(root)
+    folder = find_model(root)
     # Programs that write transforms.json leave the model it was made from in these places.
     if folder in ("colmap/sparse/0", "colmap_sparse/0") and (root / "transforms.json").exists():
         return None
@@ -54,18 +59,23 @@ def read_capture(
     """A capture of a COLMAP model and a folder `images`.
 
     Args:
-        folder: of the model below the root; None looks in the usual places.
+        folder: of the model below the root, for layouts that have one place for it; None looks in the usual
+            places and takes the model with most photographs.
         indexed: whether index files are demanded.
         depths: folder of monocular depth maps, where the layout has one.
     """
-    if folder is None:
-        folder = colmap_model.find_model(root)
+    chosen, said = choose_model(root, request.colmap_model)
+    folder = chosen if folder is None or request.colmap_model else folder
     if folder is None:
         raise SceneError(
             "there is no COLMAP model in this folder",
             where=root,
             todo="put cameras.bin and images.bin (or the .txt pair) into sparse/0",
         )
+    if folder != chosen:
+        said = [f"{folder} is read, which the index files were made for, not {chosen}"] if chosen else []
+    for line in said:
+        log.log(logging.INFO if folder == find_model(root) else logging.WARNING, "%s: %s", root, line)
     model = colmap_model.read_model(root, folder, outside=request.allow_outside)
     points = find_points(root, folder)
     for image in model.images:
@@ -92,5 +102,5 @@ def read_capture(
         photographs="images",
         mask_folder=mask_folder,
         points_file=points,
-        notes=tuple(notes),
+        notes=(*notes, *said),
     )

@@ -29,5 +29,5 @@ def recognise(root: Path) -> str | None:
 
 
 def read(root: Path, request: Request) -> Capture:
-    """Reads the model in sparse/0."""
-    return colmap.read_capture(root, request, "mip360", folder="sparse/0")
+    """Reads the model in sparse/0, or another of sparse/ that has more photographs."""
+    return colmap.read_capture(root, request, "mip360")

@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from datamodules.capture import Capture
-from datamodules.files import colmap_model
+from datamodules.files.find_model import find_model
 from datamodules.files.paths import inside
 from datamodules.layouts import colmap, llff, transforms
 from datamodules.request import Request
@@ -87,7 +87,7 @@ def _last_part(file_path: str) -> str:
 
 def _filmed(root: Path, base: Path, request: Request, *, prefer_llff: bool) -> Capture:
     tables: Sequence[str] = [name for name in _LLFF if (base / name).is_file()]
-    folder = colmap_model.find_model(base)
+    folder = find_model(base)
     if tables and (prefer_llff or folder is None):
         capture = llff.read_capture(base, request, "omni3d", file=tables[0], mask_folder="matting")
     elif folder is not None and not prefer_llff:

@@ -110,16 +110,17 @@ def find_ignored(capture: Capture, wanted: Sequence[int], request: Request) -> d
 def _find_folder(
     capture: Capture, photographs: Sequence[tuple[str, ...]], wanted: Sequence[int], request: Request
 ) -> tuple[str | None, list[str]]:
-    """The folder of masks and a note on it: the one that the request names, the layout's, or the only other one
-    that is called like a folder of masks and holds one for each wanted photograph."""
+    """The folder of masks and a note on it: the one that the request names, the layout's, or, where that holds
+    none, the only other one that is called like a folder of masks and holds one for each wanted photograph."""
     folder = request.masks or capture.mask_folder
     if folder is None:
         return None, []
     if request.masks and Path(folder).is_absolute():
         folder = os.path.relpath(folder, capture.root)
-    if inside(capture.root, folder, outside=request.allow_outside).is_dir():
-        return folder, []
+    own = inside(capture.root, folder, outside=request.allow_outside)
     if request.masks:
+        if own.is_dir():
+            return folder, []
         raise SceneError(
             f"there is no folder {printable(folder)} for the masks",
             where=capture.root,
@@ -127,15 +128,18 @@ def _find_folder(
         )
     others = []
     for path in sorted(capture.root.iterdir()):
-        if path.name.lower() in _OTHER_FOLDERS and path.is_dir():
+        if path.name.lower() in _OTHER_FOLDERS and path.name != folder and path.is_dir():
             matched, _ = _match(photographs, _image_files(path))
             if all(len(matched.get(i, ())) == 1 for i in wanted):
                 others.append(path.name)
+    if own.is_dir() and (not others or _match(photographs, _image_files(own))[0].keys() & set(wanted)):
+        too = [f"masks are read from {folder}, not from {list_some(others)} (--masks)"]
+        return folder, too if others else []
     if len(others) == 1:
         return others[0], [f"masks are read from the folder {others[0]}, for want of {folder}"]
     if others:
         raise SceneError(
-            f"the folder {folder} is missing, and {' and '.join(others)} could stand in for it",
+            f"the folder {folder} has no masks, and {' and '.join(others)} could stand in for it",
             where=capture.root,
             todo=f"say which holds masks that are white on the object: --masks {others[0]}",
         )

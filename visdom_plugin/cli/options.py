@@ -27,7 +27,7 @@ Device = Literal["auto", "cpu", "cuda"]
 Budget = Literal["quick", "full"]
 READING = (
     "views", "downscale", "seed", "missing_masks", "mask_source", "data_format", "train_list", "test_list",
-    "split", "frame", "masks", "mask_path", "allow_outside",
+    "split", "frame", "masks", "colmap_model", "mask_path", "allow_outside",
 )  # fmt: skip
 """Common options that say how a scene is read, kept in run.json to read it again."""
 
@@ -48,6 +48,8 @@ class Reading:
     """Which frame of a video layout (ActorsHQ); by default the first there is."""
     masks: str | None = None
     """Folder of the foreground masks, below the scene's; by default masks, or one that is called alike."""
+    colmap_model: str | None = None
+    """Folder of the COLMAP model, such as sparse/1; by default, of several, the one with most photographs."""
     mask_path: Literal["ignore", "foreground"] = "ignore"
     """What mask_path in a transforms.json names: black is to be ignored (nerfstudio), or white is the object."""
     allow_outside: bool = False

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -130,3 +131,17 @@ def test_an_opaque_alpha_channel_is_not_called_absent(views, tmp_path):
         cv2.imwrite(str(path), pixels)
     with pytest.raises(SceneError, match="no folder masks, and its alpha channel is opaque everywhere"):
         load(folder, views=7)
+
+
+def test_of_two_folders_of_masks_the_usual_one_is_read_and_that_is_said(views, tmp_path):
+    folder = w.write_colmap(views, tmp_path / "s")
+    expected = _masks(folder)
+    shutil.copytree(folder / "masks", folder / "mask")
+    for path in (folder / "mask").iterdir():
+        cv2.imwrite(str(path), 255 - cv2.imread(str(path), 0))
+    scene = load(folder, views=7)
+    assert all(map(torch.equal, scene.train.masks, expected))
+    assert any("masks are read from masks, not from mask" in note for note in scene.notes)
+    shutil.rmtree(folder / "masks")
+    (folder / "masks").mkdir()
+    assert torch.equal(load(folder, views=7).train.masks[0], ~expected[0])
