@@ -80,3 +80,9 @@ def test_without_a_method_or_with_an_unknown_one_the_kit_says_which_there_are():
         done = kit(*words)
         assert done.returncode == 4 and said in done.stderr, done.stderr
         assert "Traceback" not in done.stderr
+
+
+def test_help_and_version_need_no_method():
+    done = kit("--help")
+    assert done.returncode == 0 and "--method=NAME" in done.stdout
+    assert kit("--version").returncode == 0

@@ -51,6 +51,8 @@ def run(tmp_path_factory):
     sources = shutil.copytree(
         EXAMPLE, folder / "sources", ignore=shutil.ignore_patterns("build", "*.egg-info")
     )
+    # A run in the folder of the example leaves this behind.
+    (sources / "runs").mkdir()
     pip = [
         sys.executable,
         "-m",

@@ -25,7 +25,7 @@ def pytest_configure(config) -> None:
     Raises:
         UsageError: where none is given, or one is unknown.
     """
-    if not hasattr(config.option, "visdom_methods"):
+    if not hasattr(config.option, "visdom_methods") or config.option.help or config.option.version:
         return
     from visdom_plugin import registry
     from visdom_plugin.errors import VisDomError

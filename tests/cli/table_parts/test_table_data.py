@@ -10,6 +10,7 @@ from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
 from tests.datamodules.layouts.layout_writers import join, write_colmap
 from tests.datamodules.layouts.prepared_writer import write_prepared
+from visdom_plugin.cli.commands import table
 from visdom_plugin.cli.options import READING
 from visdom_plugin.cli.table_parts.table_data import OWN, DataHasher, tidy_reading
 from visdom_plugin.cli.table_parts.workshop import make_workshop
@@ -123,6 +124,19 @@ def test_a_scene_that_cannot_be_read_is_another_run_once_it_is_mended(root):
 def test_a_reading_holds_only_how_a_scene_is_read(name, root):
     with pytest.raises(ConfigError, match=f"reading cannot hold '{name}'(.|\n)*column 'c' of t.yaml"):
         _plan(root, reading={name: True})
+
+
+@pytest.mark.parametrize("views", [4, 5])
+def test_a_dry_run_names_a_scene_that_cannot_be_read(root, capsys, views):
+    Path("t.yaml").write_text(
+        "rows: [{label: A, method: ingp+vd}]\n"
+        f"columns: [{{label: c, root: mine, scenes: [thing], views: {views}}}]"
+    )
+    status = table.main(["t.yaml", "--root", "mine=mine", "--dry-run", "--device", "cpu"])
+    listed, said = capsys.readouterr()
+    assert status == (views == 5)
+    assert listed.startswith("cannot be read" if views == 5 else "run") and "1 job, 1 run, 1 of" in listed
+    assert ("there is no sparse_5.txt" in said) == (views == 5)
 
 
 def test_what_a_reading_may_hold_reaches_the_run():

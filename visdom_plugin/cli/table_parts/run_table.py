@@ -76,8 +76,10 @@ def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | Non
     """Runs a table as the options say.
 
     Returns:
-        the exit status, and what there is of the runs; None in place of it when they were only listed.
+        the exit status, and what there is of the runs; None in place of it when they were only listed, where the
+        status is 1 for scenes that cannot be read.
     """
+    from visdom_plugin.cli.report import say
     from visdom_plugin.cli.table_parts.workshop import make_workshop
     from visdom_plugin.tables.report.summary import summarise
     from visdom_plugin.tables.report.write import write_all
@@ -95,7 +97,10 @@ def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | Non
     executor = _make_executor(spec, options, runs, overview.tick)
     if options.dry_run:
         sys.stdout.write("\n".join(describe_plan(made)) + "\n")
-        return 0, None
+        troubles = dict.fromkeys(task.trouble for task in made.tasks.values() if task.trouble)
+        for trouble in troubles:
+            say(f"error: {trouble}")
+        return FAILURES if troubles else 0, None
     for place in (folder, runs):
         _make_folder(place)
         remove_old_parts(place)
@@ -110,8 +115,6 @@ def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | Non
     results = gather(made, look(made))
     failed = sum(outcome.status == "failed" for outcome in results.outcomes.values())
     if not options.quiet:
-        from visdom_plugin.cli.report import say
-
         markdown = folder / "table.md"
         if markdown.exists():
             sys.stdout.write(markdown.read_text(encoding="utf-8"))
@@ -194,6 +197,8 @@ def describe_plan(made: Plan) -> list[str]:
         if job.run_dir is not None:
             if job.run_dir in seen:
                 word = "shared"
+            elif made.tasks[job.run_dir].trouble and outcome.status != "finished":
+                word = "cannot be read"
             elif outcome.status == "waiting" and is_held(job.run_dir):
                 word = "running"
             elif outcome.status == "waiting" and (step := read_step(job.run_dir)):
@@ -205,7 +210,10 @@ def describe_plan(made: Plan) -> list[str]:
             f"{word:<16} {row.label} | {column.label} | {job.scene} | {job.views} | {job.seed}{where}"
         )
     todo = len(made.tasks) - sum(o.status == "finished" for o in look(made).values())
-    return [*lines, f"{len(lines)} jobs, {len(made.tasks)} runs, {todo} of them not finished"]
+    jobs, runs = (
+        f"{n} {what}{'s' * (n != 1)}" for n, what in ((len(lines), "job"), (len(made.tasks), "run"))
+    )
+    return [*lines, f"{jobs}, {runs}, {todo} of them not finished"]
 
 
 def _read_roots(options: TableOptions) -> dict[str, Path]:

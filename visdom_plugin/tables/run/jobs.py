@@ -70,6 +70,8 @@ class Task:
     """For the user."""
     method: str = ""
     """What tasks of about the same duration have in common."""
+    trouble: str = ""
+    """Why its scene cannot be read; its run will fail with these words."""
 
     def write_settings(self) -> None:
         """Writes the file that `--config` of the argv names."""
@@ -122,7 +124,7 @@ def plan(spec: TableSpec, runs: Path, workshop: Workshop, roots: Mapping[str, Pa
     folders = [_find_scenes(spec, column, dict(roots or {})) for column in spec.columns]
     looked_at = {path for scenes in folders if scenes for path in scenes.values() if path is not None}
     if looked_at:
-        log.info("looking at the files of %d scenes", len(looked_at))
+        log.info("reading the files of %d scene%s", len(looked_at), "s" * (len(looked_at) != 1))
     jobs: dict[Job, Outcome] = {}
     tasks: dict[Path, Task] = {}
     for (i, found), (j, column) in product(enumerate(resolved), enumerate(spec.columns)):
@@ -217,11 +219,12 @@ def _make_task(
     runs: Path,
     workshop: Workshop,
 ) -> Task:
+    trouble = ""
     try:
         data = workshop.hash_data(spec.kind, folder, reading, found.config)
     except SceneError as error:
         # Its run fails with the same words and does not stop the others; once mended it is another run.
-        data = f"cannot be read: {error}"
+        trouble, data = str(error), f"cannot be read: {error}"
     except ConfigError as error:
         raise _within(_place(spec, spec.columns[job.column]), error) from error
     settings = as_plain(found.config)
@@ -251,4 +254,5 @@ def _make_task(
     argv = ("--config", str(beside(run_dir, ".yaml")), "--out", str(run_dir), "--quiet")
     steps = settings.get("steps", 0) if isinstance(settings, dict) else 0
     label = f"{spec.rows[job.row].label}, {scene}, {job.views} views, seed {job.seed}"
-    return Task(run_dir, workshop.modules[spec.kind], argv, content, int(steps or 0), label, found.name)
+    module = workshop.modules[spec.kind]
+    return Task(run_dir, module, argv, content, int(steps or 0), label, found.name, trouble)
