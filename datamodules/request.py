@@ -14,14 +14,15 @@ class Request:
     """How to read a scene; every layout takes the same."""
 
     views: int | None = None
-    """Number of training views; None takes the smallest index file, or 4 where there is none."""
+    """Number of training views; None takes the smallest index file, or 4 where there is none. All train where
+    the scene has no more."""
     downscale: float = 1
     """>= 1, how much smaller than the photographs to work."""
     test: bool = True
     """False leaves the test views out and does not look at their files. Training views stay the same; only where
     more are wanted than the layout's test views leave, these are taken as well."""
     train_list: str | None = None
-    """Training views by hand: an index file, or positions and names with commas between."""
+    """Training views by hand: an index file, positions and names with commas between, or "all"."""
     test_list: str | None = None
     """Test views by hand, in the same way."""
     split: str | None = None
@@ -37,6 +38,8 @@ class Request:
     """Folder of the foreground masks, below the scene's; None takes the layout's, or one that is called alike."""
     colmap_model: str | None = None
     """Folder of the COLMAP model below the scene's, such as sparse/1; None takes the one with most photographs."""
+    invert_masks: bool = False
+    """Whether masks are black on the object; they are turned over as they are read."""
     mask_path: Literal["ignore", "foreground"] = "ignore"
     """What the files named by `mask_path` in a transforms.json mean: black pixels are to be ignored, which is
     nerfstudio's meaning, or white pixels are the object."""

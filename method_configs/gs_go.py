@@ -23,6 +23,8 @@ SPEC = MethodSpec(
         densify_until=360,
         densify_every=30,
         prune_large_from=120,
+        # Few Gaussians have to be large ones.
+        prune_radius=0.1,
         opacity_reset_every=120,
         floater_every=60,
     ),

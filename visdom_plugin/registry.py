@@ -18,7 +18,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
 
 from visdom_plugin.errors import ConfigError, PluginError, did_you_mean
 from visdom_plugin.hooks.configs import GaussianMethodConfig, SamplerMethodConfig
@@ -79,7 +78,7 @@ class Registry:
     slow: dict[str, tuple[float, list[str]]] = field(default_factory=dict)
     """Package to the seconds its names took and what heavy modules they imported, where there were any."""
 
-    def add(self, offered: Any, origin: str) -> None:
+    def add(self, offered: object, origin: str) -> None:
         """Takes over all presets of one package, or none.
 
         Args:
@@ -134,7 +133,7 @@ class Registry:
         )
 
 
-def _pairs(offered: Any, origin: str) -> list[tuple[str, Preset]]:
+def _pairs(offered: object, origin: str) -> list[tuple[str, Preset]]:
     """Names and presets of whatever a package offers."""
     if isinstance(offered, MethodSpec):
         return list(offered.presets().items())

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from importlib import import_module
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 from visdom_plugin.errors import PluginError
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
@@ -28,6 +28,12 @@ MASK_WEIGHT = 0.1
 """The paper's weight of the silhouette loss."""
 
 
+class Settings(Protocol):
+    """A method's config: an instance of a dataclass, as `MethodSpec` asks for."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
 @dataclass(frozen=True)
 class Preset:
     """One variant of a method, as people type it, with its settings."""
@@ -38,9 +44,9 @@ class Preset:
     """One line for lists and help."""
     target: str
     """Where the method's class is: "module:Class", constructed as Class(config)."""
-    quick: Any
+    quick: Settings
     """Config dataclass for minutes on two CPU cores."""
-    full: Any
+    full: Settings
     """Config dataclass with the published schedule."""
 
     hook: str | None = None
@@ -106,18 +112,18 @@ class MethodSpec:
     """As typed after `method:`, without a variant."""
     target: str
     """Where the method's class is: "module:Class", constructed as Class(config)."""
-    quick: Any
+    quick: Settings
     """An instance of the method's own config dataclass: minutes on two CPU cores."""
-    full: Any = None
+    full: Settings = None  # type: ignore[assignment]  # `quick`, then
     """The same for the published schedule; by default `quick`."""
     hook: Literal["sampler", "gaussian"] | None = None
     """Which hook the method takes; None for none, and no variants."""
     description: str = ""
     """One line for lists and help."""
-    variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    variants: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     """What a variant changes besides, by "mask" or "vd" and the config's field. A method without a hook has no
     other variants than those named here."""
-    quick_variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    quick_variants: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     """The same for the quick settings alone."""
     descriptions: Mapping[str, str] = field(default_factory=dict)
     """One line for a variant, in place of the one made from `description`."""
@@ -156,7 +162,7 @@ class MethodSpec:
                 f"the config {type(self.quick).__name__} lacks {', '.join(lacks)}",
                 f"let it inherit visdom_plugin.registry.{base}, which has mask_weight, hull and vd",
             )
-            vd = self.quick.vd
+            vd = getattr(self.quick, "vd", None)
             fits = isinstance(vd, HOOKS[self.hook]) or (
                 type(vd) not in HOOKS.values() and hasattr(vd, "build")
             )
@@ -186,12 +192,13 @@ class MethodSpec:
             made |= {name.replace(self.name, alias, 1): p for name, p in list(made.items()) if name == p.name}
         return made
 
-    def _vary(self, config: Any, suffix: str) -> Any:
-        changes: dict[str, Any] = {}
+    def _vary(self, config: Settings, suffix: str) -> Settings:
+        changes: dict[str, object] = {}
         if suffix in MADE:
             changes["mask_weight"] = MASK_WEIGHT
         if suffix == "vd":
             changes["hull"] = TRAINING_DOMAIN
-            vd: Any = config.vd if is_dataclass(config.vd) else HOOKS[self.hook or ""]()
-            changes["vd"] = replace(vd, enabled=True)
+            vd = getattr(config, "vd", None)
+            base: Any = vd if is_dataclass(vd) else HOOKS[self.hook or ""]()
+            changes["vd"] = replace(base, enabled=True)
         return replace(config, **changes | dict(self.variants.get(suffix, {})))

@@ -83,7 +83,7 @@ def time_step(n: int, size: int, repeats: int, reference: bool) -> list[float]:
     def draw(gaussians: Gaussians) -> torch.Tensor:
         if reference:
             return dense(gaussians, camera, background)
-        return rasterise(gaussians, camera, background).rgb
+        return rasterise(gaussians, camera, background, near=0.01).rgb
 
     gaussians = sphere(n, 0)
     parameters = [p.requires_grad_() for p in gaussians.tensors().values()]

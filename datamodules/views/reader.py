@@ -112,6 +112,8 @@ class ViewReader:
         photo = open_photograph(reading, file, full)
         plan = repr((full, self._K[i].tolist(), self._distortions[i], reading.factor, reading.downscale))
         state = hashlib.sha256(f"{_VERSION} {plan} {reading.request.mask_source}".encode())
+        if reading.request.invert_masks:
+            state.update(b"masks turned over")
         state.update(photo.data)
         if photo.orientation != 1:
             state.update(b"turned by its tag where sizes or outlines ask for it")

@@ -27,6 +27,15 @@ def read_mask(
     reading: Reading, file: Frame, photo: Photograph, choose_turns: ChooseTurns
 ) -> tuple[np.ndarray | None, Path, tuple[str, ...]]:
     """(H, W) float32 opacity at the file's own size, the file, and remarks; None where there is no mask."""
+    opacity, path, remarks = _find_mask(reading, file, photo, choose_turns)
+    if opacity is not None and reading.request.invert_masks:
+        opacity = 1 - opacity
+    return opacity, path, remarks
+
+
+def _find_mask(
+    reading: Reading, file: Frame, photo: Photograph, choose_turns: ChooseTurns
+) -> tuple[np.ndarray | None, Path, tuple[str, ...]]:
     source, alpha = reading.request.mask_source, None
     if photo.alpha and source != "folder":
         alpha = masks.decode_alpha(images.decode_any(photo.data, photo.path))

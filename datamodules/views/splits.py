@@ -20,6 +20,8 @@ from visdom_plugin.errors import SceneError, list_some
 log = logging.getLogger(__name__)
 
 DEFAULT_VIEWS = 4
+ALL = "all"
+"""In place of a list by hand: every view trains that is not listed for testing."""
 _LISTED = 16
 """Longest list of views that an error spells out."""
 
@@ -70,7 +72,9 @@ def choose(
     train = held = None
     train_where, test_where = "--train-list", "--test-list"
     files = _index_files(root)
-    if request.train_list is not None:
+    if request.train_list == ALL:
+        rules.append("all views train but those listed for testing")
+    elif request.train_list is not None:
         train = read_list(request.train_list, names, train_where)
         rules.append("training views as listed by hand")
         if request.views not in (None, len(train)):
@@ -105,6 +109,12 @@ def choose(
     if train is None:
         # Test views stay out of training even when nobody asks for them: --views N means the same everywhere.
         every = [i for i in sorted({*pools.train, *pools.test}) if not (listed and i in held)]
+        wanted = DEFAULT_VIEWS if request.views is None else request.views
+        if every and (request.train_list == ALL or len(every) <= wanted):
+            if request.train_list != ALL:
+                rules = [f"all {len(every)} views train, there are no more than the {wanted} wanted"]
+                log.info("%s: %s", root, rules[0])
+            return Split(every, held if listed and request.test else [], hashes, "; ".join(rules))
         pool = [i for i in pools.train if i not in held] if request.hold_out else every
         if not request.test and request.hold_out and len(pool) < (request.views or 1) <= len(every):
             log.info(

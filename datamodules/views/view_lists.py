@@ -8,6 +8,7 @@ files; everywhere else a number with two meanings is refused.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -20,8 +21,8 @@ def read_list(text: str, names: Sequence[str], where: str) -> list[int]:
     """Positions of the listed views, in the order of the list.
 
     Args:
-        text: positions and names (with or without ending) with commas between, or the path of a file that holds
-            them one per line or with commas between; blanks part numbers, and names that have none.
+        text: positions and names (with or without ending and folder) with commas between, or the path of a file
+            that holds them one per line or with commas between; blanks part numbers, and names that have none.
         names: of all views, in the layout's order.
         where: the option, for errors.
 
@@ -63,14 +64,18 @@ def is_integer(word: str) -> bool:
 
 class _Names(NamedTuple):
     places: dict[str, int]
-    """Positions by name, with and without ending."""
+    """Positions by name, with and without ending and folder."""
     total: int
     """Number of views."""
 
     @classmethod
     def of(cls, names: Sequence[str]) -> _Names:
-        bare = {PurePosixPath(name).with_suffix("").as_posix(): i for i, name in enumerate(names)}
-        return cls(bare | {name: i for i, name in enumerate(names)}, len(names))
+        paths = [PurePosixPath(name) for name in names]
+        # Without its folder a name may stand for several views, and then for none.
+        counts = Counter(short for path in paths for short in {path.name, path.stem})
+        short = {s: i for i, path in enumerate(paths) for s in (path.stem, path.name) if counts[s] == 1}
+        bare = {path.with_suffix("").as_posix(): i for i, path in enumerate(paths)}
+        return cls(short | bare | {name: i for i, name in enumerate(names)}, len(names))
 
     def position(self, word: str) -> int | None:
         return int(word) if is_integer(word) and 0 <= int(word) < self.total else None

@@ -285,6 +285,7 @@ def test_a_foreign_training_loop_fades_what_floats_outside(ball):
             ),
             camera,
             torch.ones(3),
+            near=0.01,
         )
 
     for step in range(60):

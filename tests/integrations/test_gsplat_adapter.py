@@ -58,7 +58,7 @@ def draw(params, camera, background=None):
         opacity_logits=params["opacities"],
         sh=torch.cat([params["sh0"], params["shN"]], 1),
     )
-    return rasterise(gaussians, camera, torch.ones(3) if background is None else background)
+    return rasterise(gaussians, camera, torch.ones(3) if background is None else background, near=0.01)
 
 
 def initial(xyz):

@@ -21,7 +21,7 @@ camera = Cameras.from_matrices(
 )
 tensors = [draw(300, 3) + torch.tensor([0.0, 0, 4]), draw(300, 3) - 2, draw(300, 4), draw(300), draw(300, 4, 3)]
 tensors = [t.requires_grad_() for t in tensors]
-render = rasterise(Gaussians(*tensors), camera, torch.ones(3))
+render = rasterise(Gaussians(*tensors), camera, torch.ones(3), near=0.01)
 loss = 1 - ssim(render.rgb, torch.rand(40, 48, 3, generator=g)) + render.alpha.mean() + render.depth.mean()
 loss.backward()
 digest = hashlib.sha256()

@@ -74,7 +74,7 @@ def test_both_backends_draw_the_same():
         gaussians = make_gaussians(n=300, dtype=torch.float32).detach().to(device)
         for parameter in gaussians.tensors().values():
             parameter.requires_grad_()
-        render = rasterise(gaussians, camera.to(device), background)
+        render = rasterise(gaussians, camera.to(device), background, near=0.01)
         (render.rgb.square().sum() + render.alpha.sum() + render.depth.sum()).backward()
         gradients = [p.grad for p in gaussians.tensors().values()] + [render.info["means2d"].grad]
         results.append([x.detach().cpu() for x in (render.rgb, render.alpha, render.depth, *gradients)])

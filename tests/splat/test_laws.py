@@ -15,7 +15,7 @@ WHITE = torch.ones(3)
 
 
 def render_with_gradients(gaussians, camera):
-    render = rasterise(gaussians, camera, WHITE)
+    render = rasterise(gaussians, camera, WHITE, near=0.01)
     (render.rgb.square().sum() + render.depth.sum()).backward()
     gradients = [p.grad for p in gaussians.tensors().values()] + [render.info["means2d"].grad]
     return [render.rgb, render.alpha, render.depth, *gradients]
@@ -60,8 +60,8 @@ def test_a_rigid_motion_of_everything_changes_nothing():
     motion = camera.world_from_camera.clone()
     motion[:3, :3] = rotation @ motion[:3, :3]
     motion[:3, 3] = rotation @ motion[:3, 3] + shift
-    a = rasterise(gaussians, camera, WHITE)
-    b = rasterise(moved, Cameras(camera.intrinsics, motion, camera.width, camera.height), WHITE)
+    a = rasterise(gaussians, camera, WHITE, near=0.01)
+    b = rasterise(moved, Cameras(camera.intrinsics, motion, camera.width, camera.height), WHITE, near=0.01)
     for name in ("rgb", "alpha", "depth"):
         torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=1e-9, atol=1e-9)
 
@@ -69,7 +69,7 @@ def test_a_rigid_motion_of_everything_changes_nothing():
 def test_alpha_is_bounded_and_the_background_enters_linearly():
     gaussians = make_gaussians(n=400, dtype=torch.float32, scale=0.3, opacity=4.0).detach()
     backgrounds = torch.tensor([[0.0, 0.0, 0.0], [0.3, 1.0, 0.6]])
-    black, coloured = (rasterise(gaussians, make_camera(), b) for b in backgrounds)
+    black, coloured = (rasterise(gaussians, make_camera(), b, near=0.01) for b in backgrounds)
     assert (black.alpha >= 0).all() and (black.alpha <= 1).all() and black.alpha.max() > 0.99
     expected = black.rgb + (1 - black.alpha)[..., None] * backgrounds[1]
     torch.testing.assert_close(coloured.rgb, expected, rtol=0, atol=1e-6)
@@ -77,7 +77,7 @@ def test_alpha_is_bounded_and_the_background_enters_linearly():
 
 def test_depth_lies_between_the_nearest_and_the_farthest():
     gaussians = make_gaussians(n=50).detach()
-    render = rasterise(gaussians, make_camera(), WHITE)
+    render = rasterise(gaussians, make_camera(), WHITE, near=0.01)
     z = render.info["depths"][render.info["visible"]]
     hit = render.alpha > 0
     assert (render.depth[hit] >= z.min() - 1e-9).all() and (render.depth[hit] <= z.max() + 1e-9).all()
@@ -86,7 +86,7 @@ def test_depth_lies_between_the_nearest_and_the_farthest():
 
 def test_no_gaussians_show_the_background():
     gaussians = make_gaussians(n=0, dtype=torch.float32)
-    render = rasterise(gaussians, make_camera(), torch.tensor([0.1, 0.2, 0.3]))
+    render = rasterise(gaussians, make_camera(), torch.tensor([0.1, 0.2, 0.3]), near=0.01)
     render.rgb.sum().backward()
     assert torch.equal(render.rgb, torch.tensor([0.1, 0.2, 0.3]).expand_as(render.rgb))
     assert not render.alpha.any() and not render.depth.any()
@@ -99,7 +99,7 @@ def test_one_gaussian_on_the_axis_peaks_at_the_principal_point_with_its_depth():
         torch.zeros(1, 3), torch.full((1, 3), -2.0), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1),
         torch.zeros(1, 1, 3),
     )  # fmt: skip
-    render = rasterise(one, camera, torch.zeros(3))
+    render = rasterise(one, camera, torch.zeros(3), near=0.01)
     assert render.alpha.argmax() == 10 * 21 + 10
     assert render.alpha[10, 10].item() == pytest.approx(0.5, abs=1e-4)
     assert render.rgb[10, 10, 0].item() == pytest.approx(0.25, abs=1e-4)
@@ -114,7 +114,7 @@ def test_what_is_not_drawn_gets_no_gradient_and_no_radius():
         gaussians.opacity_logits[2] = -9.0  # below 1/255
         gaussians.means[3, 1] = float("nan")
         gaussians.log_scales[4, 2] = float("nan")
-    render = rasterise(gaussians, camera, WHITE)
+    render = rasterise(gaussians, camera, WHITE, near=0.01)
     (render.rgb.sum() + render.depth.sum()).backward()
     assert render.info["visible"].tolist() == [False] * 5 + [True]
     assert torch.isfinite(render.rgb).all() and render.alpha.any()
@@ -128,10 +128,10 @@ def test_gradients_of_several_renders_add_up():
     apart = []
     for camera in cameras:
         gaussians = make_gaussians(n=40)
-        rasterise(gaussians, camera, WHITE).rgb.square().sum().backward()
+        rasterise(gaussians, camera, WHITE, near=0.01).rgb.square().sum().backward()
         apart.append(gaussians.means.grad)
     gaussians = make_gaussians(n=40)
-    renders = [rasterise(gaussians, camera, WHITE) for camera in cameras]
+    renders = [rasterise(gaussians, camera, WHITE, near=0.01) for camera in cameras]
     sum(r.rgb.square().sum() for r in renders).backward()
     torch.testing.assert_close(gaussians.means.grad, apart[0] + apart[1])
 
@@ -158,9 +158,9 @@ def test_warm_up_leaves_nothing_to_compile():
 )
 def test_wrong_arguments_are_named(arguments, message):
     with pytest.raises(ConfigError, match=message):
-        rasterise(make_gaussians(n=2, degree=1), make_camera(), WHITE, **arguments)
+        rasterise(make_gaussians(n=2, degree=1), make_camera(), WHITE, **arguments, near=0.01)
 
 
 def test_a_batch_of_cameras_is_refused():
     with pytest.raises(ConfigError, match="one camera"):
-        rasterise(make_gaussians(n=2), Cameras.stack([make_camera()] * 2), WHITE)
+        rasterise(make_gaussians(n=2), Cameras.stack([make_camera()] * 2), WHITE, near=0.01)

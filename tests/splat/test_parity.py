@@ -35,7 +35,7 @@ def both(scene, camera, dtype, sh_degree=None):
     fast, slow = make_gaussians(**SCENES[scene], dtype=dtype), make_gaussians(**SCENES[scene])
     background = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
     backgrounds = [background.to(d, copy=True).requires_grad_() for d in (dtype, torch.float64)]
-    render = rasterise(fast, camera, backgrounds[0], sh_degree=sh_degree)
+    render = rasterise(fast, camera, backgrounds[0], sh_degree=sh_degree, near=0.01)
     rgb, alpha, depth, means2d = rasterise_twin(slow, camera, backgrounds[1], sh_degree=sh_degree)
     weigh(render.rgb, render.alpha, render.depth).backward()
     weigh(rgb, alpha, depth).backward()
@@ -83,7 +83,7 @@ def test_gradients_equal_finite_differences(name):
     gaussians = make_gaussians(n=25)
 
     def loss():
-        render = rasterise(gaussians, camera, background)
+        render = rasterise(gaussians, camera, background, near=0.01)
         return weigh(render.rgb, render.alpha, render.depth)
 
     loss().backward()
@@ -113,7 +113,7 @@ def test_projection_and_harmonics_equal_gsplat():
         gaussians.means, covariances, *matrices, 41, 19
     )
     for degree in range(4):
-        info = rasterise(gaussians, camera, torch.zeros(3), sh_degree=degree).info
+        info = rasterise(gaussians, camera, torch.zeros(3), sh_degree=degree, near=0.01).info
         seen = info["visible"]
         assert 20 < seen.sum() < 200
         direction = gaussians.means - camera.centres

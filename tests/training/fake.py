@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from visdom_plugin.render import Render
 from visdom_plugin.scene import Scene, Views
 from visdom_plugin.seeding import generator
 from visdom_plugin.training.protocols import StepOutput
+from visdom_plugin.training.runs import checkpoints
 
 NAME = "fake"
 
@@ -179,6 +181,18 @@ def main(run_dir: str, steps: str) -> None:
         quiet=True,
         checkpoint_seconds=0.02,
     )
+
+
+def state_of(run_dir: Path) -> dict[str, torch.Tensor]:
+    return checkpoints.load_newest(run_dir / "checkpoints").tensors
+
+
+def same(a, b) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+def log_of(run_dir: Path) -> list[dict]:
+    return [json.loads(line) for line in (run_dir / "log.jsonl").read_text().splitlines()]
 
 
 if __name__ == "__main__":

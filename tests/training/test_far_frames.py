@@ -115,7 +115,7 @@ def test_gaussians_are_exported_where_the_capture_is(scene, name, far, tmp_path)
         local = read_ply(path, local_origin(here.train.cameras)).means
         inner = getattr(method, "method", method)
         splats = inner.sets[0] if name.startswith("corgs") else inner.splats
-        assert (local - splats.means).abs().max() < 1e-8
+        assert (local - splats.means).abs().max() < 1e-6
     assert np.abs(means[0] + shift_of(far).numpy() - means[1]).max() < 1e-4
 
 

@@ -24,8 +24,10 @@ class Early:
     config: str | None = None
     budget: str | None = None
     device: str | None = None
+    views: str | None = None
     quiet: bool = False
     help: bool = False
+    version: bool = False
     leave_one_out: bool = False
 
 
@@ -36,7 +38,7 @@ def read_early(argv: Sequence[str]) -> Early:
     values: dict[str, str] = {}
     for i, word in enumerate(rest):
         name, equals, value = word.partition("=")
-        if name in ("--config", "--budget", "--device") and (equals or i + 1 < len(rest)):
+        if name in ("--config", "--budget", "--device", "--views") and (equals or i + 1 < len(rest)):
             values[name] = value if equals else rest[i + 1]
     return Early(
         methods=methods,
@@ -44,7 +46,9 @@ def read_early(argv: Sequence[str]) -> Early:
         config=values.get("--config"),
         budget=values.get("--budget"),
         device=values.get("--device"),
+        views=values.get("--views"),
         quiet="--quiet" in rest,
         help="--help" in rest or "-h" in rest,
+        version="--version" in rest,
         leave_one_out="--leave-one-out" in rest,
     )

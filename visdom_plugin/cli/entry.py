@@ -6,9 +6,10 @@ import errno
 import logging
 import sys
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 
 from visdom_plugin.cli.early import read_early
-from visdom_plugin.errors import VisDomError
+from visdom_plugin.errors import ConfigError, VisDomError
 
 USER_ERROR, INTERRUPTED = 2, 130
 BUG = "this is a bug in visdom-plugin or in a plugin; please report it with:"
@@ -33,8 +34,13 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
         Any other exception goes on, with a line that calls it a bug.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    set_up_logging(read_early(words).quiet)
+    early = read_early(words)
+    set_up_logging(early.quiet)
+    if early.version:
+        print(f"visdom-plugin {version('visdom-plugin')}")
+        return 0
     try:
+        _check_views(early.views)
         return command(words) or 0
     except VisDomError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -62,6 +68,16 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
     except Exception:
         print(BUG, file=sys.stderr)
         raise
+
+
+def _check_views(text: str | None) -> None:
+    if text is not None and not text.lstrip("-").isdecimal():
+        raise ConfigError(
+            f"--views is {text!r}, and it takes one whole number",
+            cause="several numbers of views at once" if "," in text else None,
+            todo="run once for each number, or write a table with `views: [4, 6]` for visdom-table; views by name "
+            "or position go to --train-list",
+        )
 
 
 def set_up_logging(quiet: bool = False) -> None:

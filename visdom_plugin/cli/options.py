@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, cast, get_a
 
 import tyro
 
-from datamodules.recognise import FORMATS
+from datamodules.recognise import FORMATS, find_folder
 from visdom_plugin import registry
 from visdom_plugin.cli.early import WORD, Early, read_early
 from visdom_plugin.errors import ConfigError, unknown_name
@@ -27,7 +27,7 @@ Device = Literal["auto", "cpu", "cuda"]
 Budget = Literal["quick", "full"]
 READING = (
     "views", "downscale", "seed", "missing_masks", "mask_source", "data_format", "train_list", "test_list",
-    "split", "frame", "masks", "colmap_model", "mask_path", "allow_outside",
+    "split", "frame", "masks", "colmap_model", "invert_masks", "mask_path", "allow_outside",
 )  # fmt: skip
 """Common options that say how a scene is read, kept in run.json to read it again."""
 
@@ -39,7 +39,7 @@ class Reading:
     data_format: DataFormat | None = None
     """How the scene lies on disk; by default recognised."""
     train_list: str | None = None
-    """Training views by hand in place of --views: an index file, or positions and names with commas between."""
+    """Training views by hand in place of --views: an index file, positions and names with commas, or all."""
     test_list: str | None = None
     """Test views by hand, in the same way."""
     split: str | None = None
@@ -50,6 +50,8 @@ class Reading:
     """Folder of the foreground masks, below the scene's; by default masks, or one that is called alike."""
     colmap_model: str | None = None
     """Folder of the COLMAP model, such as sparse/1; by default, of several, the one with most photographs."""
+    invert_masks: bool = False
+    """The masks are black on the object: turn them over."""
     mask_path: Literal["ignore", "foreground"] = "ignore"
     """What mask_path in a transforms.json names: black is to be ignored (nerfstudio), or white is the object."""
     allow_outside: bool = False
@@ -63,7 +65,7 @@ class SceneOptions(Reading):
     data: Path | None = None
     """Folder of the scene; without it, the built-in scene."""
     views: int = 4
-    """Training views."""
+    """Training views; all train where the scene has no more."""
     downscale: float = 1.0
     """Work on images smaller by this factor."""
     missing_masks: Annotated[Literal["error", "colour", "hull"], tyro.conf.arg(name="data.missing-masks")] = (
@@ -84,7 +86,7 @@ class SceneOptions(Reading):
 
 @dataclass(frozen=True)
 class FolderOptions(SceneOptions):
-    """Options of the commands that look at a scene and train nothing."""
+    """Options of the commands that take the scene as a word of its own, too."""
 
     folder: tyro.conf.Positional[Path | None] = None
     """Folder of the scene; without it, the built-in scene."""
@@ -102,7 +104,7 @@ class FolderOptions(SceneOptions):
 
 
 @dataclass(frozen=True)
-class Common(SceneOptions):
+class Common(FolderOptions):
     """Options of every training run."""
 
     device: Device = "auto"
@@ -154,6 +156,7 @@ def parse(
         SystemExit: by tyro, for --help (0) and for unknown options or values (2).
     """
     early = read_early(argv)
+    early = _find_method(early)
     named = name_method(early)
     file, where = ({}, "") if early.config is None else (_read(Path(early.config)), early.config)
     name = named or file.get("method")
@@ -190,7 +193,20 @@ def parse(
         config=(tyro.conf.AvoidSubcommands,),
     )
     common = Common(**{f.name: getattr(parsed, f.name) for f in fields(Common)})
-    return Request(preset, parsed.method, replace(common, budget=budget), note)
+    common = replace(common, budget=budget, data=common.scene_folder, folder=None)
+    if common.data is not None:
+        find_folder(common.data)
+    return Request(preset, parsed.method, common, note)
+
+
+def _find_method(early: Early) -> Early:
+    """A method's name without the word before it is taken for the method where none is named."""
+    known = registry.installed()
+    for i, word in enumerate(early.rest):
+        is_value = i > 0 and early.rest[i - 1].startswith("-")
+        if not early.methods and not is_value and (word in known.presets or word in known.aliases):
+            return replace(early, methods=(word,), rest=(*early.rest[:i], *early.rest[i + 1 :]))
+    return early
 
 
 def name_method(early: Early) -> str | None:

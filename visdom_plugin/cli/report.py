@@ -57,8 +57,12 @@ def show_result(record: dict[str, Any], folder: Path) -> None:
             f"training {timing['train_s']:.1f} s ({timing['step_ms']:.1f} ms a step), "
             f"hull {timing['hull_s']:.2f} s, evaluation {timing['eval_s']:.1f} s"
         )
+    for name, count in record.get("model", {}).items():
+        console.print(f"model: {count:,} {name.capitalize()}", highlight=False)
     for label, name in (
         ("look at", "renders/test_sheet.png"),
+        ("look at", "renders/training_sheet.png"),
+        ("orbit", "renders/orbit_sheet.png"),
         ("renders", "renders/test"),
         ("export", "export"),
         ("hull", "hull/hull.ply"),

@@ -72,7 +72,7 @@ class Subject:
             self.bare, self.hooked = None, preset
         self.main: Preset = self.hooked or preset
         self.hook = self.main.hook
-        self.config = self.main.quick
+        self.config: Any = self.main.quick
 
     def start(
         self, config: Any = None, hooks: list[Any] | None = None, device: torch.device = CPU, luck: int = 0
@@ -150,7 +150,8 @@ class Subject:
     def switch_off(self) -> Any:
         """The bare variant's config with the hook's settings, the hook off, and its hull if it has none itself."""
         assert self.bare is not None, "asked for a method without a bare variant"
-        bare, vd = self.bare.quick, self.config
+        bare: Any = self.bare.quick
+        vd = self.config
         changes = {"vd": replace(vd.vd, enabled=False)}
         if "hull" in {f.name for f in fields(bare)} and bare.hull is None:
             changes["hull"] = vd.hull

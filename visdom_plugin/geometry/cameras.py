@@ -144,6 +144,12 @@ class Cameras:
         motion[..., :3, 3] = (self.centres.double() - origin.to(motion.device)).to(motion)
         return Cameras(self.intrinsics, motion, self.width, self.height)
 
+    def in_units(self, length: float) -> Cameras:
+        """The same cameras with positions counted in lengths of that many scene units."""
+        motion = self.world_from_camera.clone()
+        motion[..., :3, 3] = (self.centres.double() / length).to(motion)
+        return Cameras(self.intrinsics, motion, self.width, self.height)
+
     def resized(self, width, height) -> Cameras:
         """Cameras whose images were resampled to another size, each axis by its own ratio."""
         width, height = _sizes(self.shape, self.width.device, width=width, height=height)
@@ -350,9 +356,16 @@ def look_at_point(cameras: Cameras) -> Tensor:
         (3,) world frame.
     """
     centres, forward = cameras.centres, cameras.forward
-    spread = (centres - centres.mean(0)).norm(dim=-1).mean().clamp_min(1e-6)
+    spread = (centres - centres.mean(0)).norm(dim=-1).mean()
+    spread = torch.where(spread > 0, spread, 1e-6)
     across = torch.eye(3).to(centres) - forward[:, :, None] * forward[:, None, :]
     prior = (centres + spread * forward).mean(0)
     pull = 1e-6 * len(cameras)
     matrix = across.sum(0) + pull * torch.eye(3).to(centres)
     return torch.linalg.solve(matrix, (across @ centres[:, :, None]).sum(0)[:, 0] + pull * prior)
+
+
+def mean_distance(cameras: Cameras, target: Tensor | None = None) -> Tensor:
+    """Scalar mean distance of the cameras (N,) from a point (3,), by default the one they look at, scene units."""
+    target = look_at_point(cameras) if target is None else target
+    return (cameras.centres - target).norm(dim=-1).mean()

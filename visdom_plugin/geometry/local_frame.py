@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.geometry.cameras import Cameras, look_at_point, mean_distance
 
 REACH = 100
 """How many of its own sizes a scene may be away from the origin: float32 then rounds by 6e-6 of the size."""
@@ -54,7 +54,7 @@ def local_origin(cameras: Cameras) -> Tensor:
     middle = cameras.centres.mean(0)
     around = cameras.relative_to(middle)
     centre = look_at_point(around)
-    distance = float((around.centres - centre).norm(dim=-1).mean().clamp_min(1e-12))
+    distance = max(float(mean_distance(around, centre)), 1e-12)
     if is_near(middle + centre, distance):
         return torch.zeros(3, dtype=torch.float64)
     step = 10.0 ** math.ceil(math.log10(distance))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.geometry.cameras import Cameras, look_at_point, mean_distance
 
 
 class Frame(NamedTuple):
@@ -35,5 +35,4 @@ def frame_of(cameras: Cameras) -> Frame:
     """
     cameras = cameras.to("cpu", torch.float64)
     centre = look_at_point(cameras)
-    distance = (cameras.centres - centre).norm(dim=-1).mean().clamp_min(1e-12)
-    return Frame(centre, float(1 / distance))
+    return Frame(centre, float(1 / mean_distance(cameras, centre).clamp_min(1e-12)))

@@ -18,7 +18,8 @@ def initial_log_scales(means: Tensor) -> Tensor:
     """Isotropic log scales: root mean squared distance to the three nearest neighbours, as in 3DGS.
 
     Args:
-        means: (N, 3).
+        means: (N, 3), in a unit of about the scene's size: a lone Gaussian has scale 1, several at one place
+            have 1e-7.
 
     Returns:
         (N, 3).

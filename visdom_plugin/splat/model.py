@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
+from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.render import Render
 from visdom_plugin.splat.densify import initial_log_scales
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.optimiser import GaussianOptimiser
+from visdom_plugin.splat.rasterise import NEAR, rasterise
 from visdom_plugin.splat.set_config import GaussianSetConfig
 from visdom_plugin.splat.spherical_harmonics import sh_from_rgb
 
@@ -18,36 +25,45 @@ RESET_OPACITY = 0.01  # 3DGS
 class GaussianSet:
     """Gaussians in training.
 
+    Their parameters are in a unit of the capture's own: float32 rounds alike whatever the unit of the scene.
+
     Args:
         config: learning rates, harmonics and thresholds.
-        xyz: (N, 3) centres to start from, world frame.
+        xyz: (N, 3) centres to start from, in the cameras' frame.
         rgb: (N, 3) their colours in [0, 1].
-        extent: the scene's, see `scene_extent`.
+        extent: the scene's, see `scene_extent`, scene units.
+        unit: of the parameters, in scene units: the cameras' mean distance from what they look at.
     """
 
     def __init__(
-        self, config: GaussianSetConfig, xyz: Tensor, rgb: Tensor, *, extent: float, device: torch.device
+        self,
+        config: GaussianSetConfig,
+        xyz: Tensor,
+        rgb: Tensor,
+        *,
+        extent: float,
+        device: torch.device,
+        unit: float = 1.0,
     ):
-        self.config, self.extent, self.device = config, extent, device
-        coefficients = (config.sh_degree + 1) ** 2
-        n = len(xyz)
+        self.config, self.extent, self.device, self.unit = config, extent / unit, device, unit
+        n, xyz = len(xyz), xyz.double() / unit
+        sh = torch.zeros(n, (config.sh_degree + 1) ** 2, 3)
+        sh[:, 0] = sh_from_rgb(rgb)
         parameters = {
             "means": xyz,
             "log_scales": initial_log_scales(xyz),
             "quaternions": torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
             "opacity_logits": torch.full((n,), INITIAL_OPACITY).logit(),
-            "sh_dc": sh_from_rgb(rgb)[:, None, :],
-            "sh_rest": torch.zeros(n, coefficients - 1, 3),
+            "sh": sh,
         }
         self.optimiser = GaussianOptimiser(
             {name: value.float().to(device) for name, value in parameters.items()},
             {
-                "means": config.lr_means * extent,
+                "means": config.lr_means * self.extent,
                 "log_scales": config.lr_scale,
                 "quaternions": config.lr_rotation,
                 "opacity_logits": config.lr_opacity,
-                "sh_dc": config.lr_sh,
-                "sh_rest": config.lr_sh / 20,
+                "sh": config.lr_sh,
             },
         )
 
@@ -56,19 +72,47 @@ class GaussianSet:
 
     @property
     def means(self) -> Tensor:
-        """(N, 3) centres, world frame, outside the graph."""
-        return self.optimiser.parameters["means"].detach()
+        """(N, 3) centres in the cameras' frame, outside the graph."""
+        return self.optimiser.parameters["means"].detach() * self.unit
 
     def gaussians(self) -> Gaussians:
-        """The current Gaussians, attached to the parameters."""
-        p = self.optimiser.parameters
-        return Gaussians(
-            means=p["means"],
-            log_scales=p["log_scales"],
-            quaternions=p["quaternions"],
-            opacity_logits=p["opacity_logits"],
-            sh=torch.cat([p["sh_dc"], p["sh_rest"]], 1),
-        )
+        """The current Gaussians in the set's own unit, attached to the parameters."""
+        return Gaussians(**self.optimiser.parameters)
+
+    def in_scene(self) -> Gaussians:
+        """The current Gaussians in the cameras' frame, outside the graph."""
+        own = self.gaussians().detach()
+        return replace(own, means=self.means, log_scales=own.log_scales + math.log(self.unit))
+
+    def draw(
+        self,
+        camera: Cameras,
+        background: Tensor,
+        gaussians: Gaussians | None = None,
+        sh_degree: int | None = None,
+    ) -> Render:
+        """See `rasterise`; depth is in scene units.
+
+        Args:
+            gaussians: what `gaussians` gave, where several pictures of one step share a graph.
+        """
+        own = self.gaussians() if gaussians is None else gaussians
+        render = rasterise(own, camera.in_units(self.unit), background, near=NEAR, sh_degree=sh_degree)
+        return replace(render, depth=render.depth * self.unit)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Parameters, moments and their unit, as a flat dict of tensors."""
+        return self.optimiser.state_dict() | {"unit": torch.tensor(self.unit, dtype=torch.float64)}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Takes over what `state_dict` gave; the number of Gaussians may differ."""
+        # Version 0.1.0 had its parameters in scene units.
+        ratio = float(state.get("unit", 1.0)) / self.unit
+        if ratio != 1:
+            factors = {"means": ratio, "adam.means.exp_avg": 1 / ratio, "adam.means.exp_avg_sq": 1 / ratio**2}
+            state = {name: value * factors.get(name, 1) for name, value in state.items()}
+            state["log_scales"] = state["log_scales"] + math.log(ratio)
+        self.optimiser.load_state_dict(state)
 
     def optimise(self, step: int) -> None:
         """One Adam step, at the step's learning rates; gradients are dropped afterwards."""

@@ -7,26 +7,32 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
-
 
 class GaussianOptimiser:
     """One Adam over named per-Gaussian parameters whose first dimension is the Gaussian.
+
+    Harmonics "sh" (N, B, 3) learn at two rates: those behind the constant at a twentieth (3DGS). Adam has one rate
+    for a tensor, so it holds them, and the state names them, as sh_dc and sh_rest.
 
     Args:
         parameters: tensors (N, ...) by name.
         learning_rates: one per name.
     """
 
+    parameters: dict[str, torch.nn.Parameter]
+    """By name; new ones after every call that changes them."""
+
     def __init__(self, parameters: Mapping[str, Tensor], learning_rates: Mapping[str, float]):
-        self.parameters = {
-            name: torch.nn.Parameter(p.detach().clone().contiguous()) for name, p in parameters.items()
-        }
+        rates = dict(learning_rates)
+        if "sh" in rates:
+            rates |= {"sh_dc": rates["sh"], "sh_rest": rates["sh"] / 20}
         groups = [
-            {"params": [p], "lr": learning_rates[name], "name": name} for name, p in self.parameters.items()
+            {"params": [torch.nn.Parameter(p.detach().clone().contiguous())], "lr": rates[name], "name": name}
+            for name, p in _split(parameters).items()
         ]
         # 3DGS's epsilon: gradients of single Gaussians are far below Adam's default 1e-8.
         self.adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self._join()
 
     def __len__(self) -> int:
         return next(iter(self.parameters.values())).shape[0]
@@ -38,8 +44,13 @@ class GaussianOptimiser:
 
     def step(self) -> None:
         """One Adam step; gradients are dropped afterwards."""
+        gradients = _split({n: p.grad for n, p in self.parameters.items() if p.grad is not None})
+        for group in self.adam.param_groups:
+            gradient = gradients.get(group["name"])
+            group["params"][0].grad = None if gradient is None else gradient.contiguous()
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
+        self._join()
 
     def keep(self, kept: Tensor) -> None:
         """Keeps the Gaussians where `kept` (N,) bool is True."""
@@ -47,6 +58,7 @@ class GaussianOptimiser:
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Adds Gaussians at the end; their moments start at zero."""
+        rows = _split(rows)
         self._replace(
             lambda name, x: torch.cat([x, rows[name].to(x)]),
             lambda name, x: torch.cat([x, torch.zeros_like(rows[name]).to(x)]),
@@ -70,7 +82,14 @@ class GaussianOptimiser:
                     state[key] = change_moments(name, state[key]).contiguous()
                 self.adam.state[new] = state
             group["params"] = [new]
-            self.parameters[name] = new
+        self._join()
+
+    def _join(self) -> None:
+        parts = {group["name"]: group["params"][0] for group in self.adam.param_groups}
+        if "sh_dc" in parts:
+            joined = torch.cat([parts.pop("sh_dc").detach(), parts.pop("sh_rest").detach()], 1)
+            parts["sh"] = torch.nn.Parameter(joined)
+        self.parameters = parts
 
     def state_dict(self) -> dict[str, Tensor]:
         """Parameters, moments and step counts as a flat dict of tensors."""
@@ -89,9 +108,18 @@ class GaussianOptimiser:
             self.adam.state.pop(group["params"][0], None)
             new = torch.nn.Parameter(state[name].to(group["params"][0]).clone())
             group["params"] = [new]
-            self.parameters[name] = new
             prefix = f"adam.{name}."
             moments = {k[len(prefix) :]: v.clone() for k, v in state.items() if k.startswith(prefix)}
             if moments:
                 # The count of steps, too: fused Adam reads it on the device.
                 self.adam.state[new] = {k: v.to(new.device) for k, v in moments.items()}
+        self._join()
+
+
+def _split(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors (N, ...) by name, as Adam holds them."""
+    parts = dict(tensors)
+    if "sh" in parts:
+        sh = parts.pop("sh")
+        parts |= {"sh_dc": sh[:, :1], "sh_rest": sh[:, 1:]}
+    return parts

@@ -10,6 +10,9 @@ from visdom_plugin.render import Render
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.spherical_harmonics import MAX_DEGREE
 
+NEAR = 0.01
+"""Where pictures begin, in mean distances of the cameras from what they look at."""
+
 
 def rasterise(
     gaussians: Gaussians,
@@ -18,7 +21,7 @@ def rasterise(
     *,
     sh_degree: int | None = None,
     backend: str = "auto",
-    near: float = 0.01,
+    near: float,
 ) -> Render:
     """Draws Gaussians as one camera sees them, differentiable in every parameter and the background.
 
@@ -33,7 +36,7 @@ def rasterise(
         background: (3,) colour in the space of the Gaussians' colours.
         sh_degree: harmonics in use, at most the stored degree; None uses all.
         backend: "cpu", "gsplat" (CUDA), or "auto": by the device of the Gaussians.
-        near: Gaussians nearer than this camera z are not drawn, scene units.
+        near: Gaussians nearer than this camera z are not drawn, scene units; `NEAR` mean camera distances.
 
     Returns:
         Render whose info holds means2d (N, 2) pixels, whose `.grad` after a backward pass is the gradient by the

@@ -77,6 +77,7 @@ MEASURES: dict[str, Measure] = {
         _of_test("chamfer_floor", "Chamfer, target to itself x 1000", False, 4, None, 1000.0),
         _of_test("iou", "IoU with the object", True, 4),
         _of_test("covered", "share of the object inside", True, 4),
+        Measure("gaussians", "Gaussians", ("model", "gaussians"), False, 0),
         Measure("train_min", "training (min)", ("timing", "train_s"), False, 1, "train_time_min", 1 / 60),
         Measure("hull_s", "hull (s)", ("timing", "hull_s"), False, 2),
         Measure("eval_s", "evaluation (s)", ("timing", "eval_s"), False, 1),

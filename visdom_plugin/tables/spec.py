@@ -92,6 +92,8 @@ class TableFile:
     """quick, full or auto, as for visdom-train."""
     varies: tuple[str, ...] = ()
     """Facts of the protocol that may differ inside this table; see FACTS."""
+    not_built: tuple[str, ...] = ()
+    """Methods that no package here offers: their rows stay empty until one does."""
     paper: str | None = None
     """Name of the CSV of the paper's numbers."""
     layout: Settings = field(default_factory=dict)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -22,17 +22,26 @@ from visdom_plugin.figures.contact_sheet import (
     write_png,
 )
 from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.training import metrics
+from visdom_plugin.training.progress import Progress
 from visdom_plugin.training.protocols import Method
 
 log = logging.getLogger(__name__)
 
 
 def evaluate(
-    method: Method, views: Views, *, reference_hull: Any, device: torch.device, folder: Path | None = None
-) -> dict[str, Any]:
+    method: Method,
+    views: Views,
+    *,
+    reference_hull: Hull | None,
+    device: torch.device,
+    folder: Path | None = None,
+    progress: Progress | None = None,
+) -> dict[str, object]:
     """Measures every view and, with a folder, writes its render and the contact sheet.
 
     A view whose mask is not its own has no truth on white: it is rendered, its metrics are NaN, it takes no part
@@ -46,13 +55,15 @@ def evaluate(
         device: where the method renders.
         folder: `<folder>/test/<name>.png` and `<folder>/test_sheet.png` are written; other pictures in
             `<folder>/test` are removed.
+        progress: entered; told of each view that is done.
 
     Returns:
         {"test": means, "per_view": {name: metrics}, "measured_views": how many the means are of, "protocol":
         metrics.PROTOCOL}; see `metrics.compare`.
     """
     perceptual = metrics.load_lpips()
-    rows: dict[str, dict[str, Any]] = {}
+    rows: dict[str, Mapping[str, object]] = {}
+    measured_rows: list[dict[str, float]] = []
     columns = []
     shown = shown_on_sheet(len(views))
     files = picture_names(views.names)
@@ -62,9 +73,12 @@ def evaluate(
         if measured:
             seen = None if reference_hull is None else hull_silhouette(reference_hull, views.cameras[i])
             image, mask, ignore = views.images[i], views.masks[i], views.ignored(i)
-            rows[name] = metrics.compare(
-                rgb, alpha, image, mask, hull_silhouette=seen, perceptual=perceptual, ignore=ignore
+            measured_rows.append(
+                metrics.compare(
+                    rgb, alpha, image, mask, hull_silhouette=seen, perceptual=perceptual, ignore=ignore
+                )
             )
+            rows[name] = measured_rows[-1]
         else:
             rows[name] = {**dict.fromkeys(metrics.NAMES, math.nan), "mask_origin": views.mask_origin(i)}
         if folder is not None:
@@ -72,12 +86,13 @@ def evaluate(
             if i in shown:
                 title = f"{name}  " + (f"{rows[name]['psnr']:.1f} dB" if measured else "no mask")
                 grey = to_bytes(alpha[..., None].expand(-1, -1, 3))
-                columns.append((title, [_draw_truth(views, i, measured), to_bytes(rgb), grey]))
+                columns.append((title, [draw_truth(views, i, measured), to_bytes(rgb), grey]))
+        if progress is not None:
+            progress.show(i + 1)
     if folder is not None:
         _remove_others(folder / "test", files)
         if columns:
             write_png(folder / "test_sheet.png", draw_sheet(columns, SHEET_ROWS))
-    measured_rows = [row for row in rows.values() if "mask_origin" not in row]
     return {
         "test": metrics.mean_over_views(measured_rows),
         "per_view": rows,
@@ -86,7 +101,7 @@ def evaluate(
     }
 
 
-def _draw_truth(views: Views, i: int, measured: bool) -> np.ndarray:
+def draw_truth(views: Views, i: int, measured: bool) -> np.ndarray:
     """The photograph as bytes, on white where a mask tells what is the object."""
     image, ignore = views.images[i], views.ignored(i)
     truth = metrics.whiten(image, views.masks[i]) if measured else image.double() / 255
@@ -115,13 +130,11 @@ def render_on_white(method: Renderer, camera: Cameras, device: torch.device) -> 
     return render.rgb.detach().cpu(), render.alpha.detach().cpu()
 
 
-def carve_reference(views: Views, domain: Any = None) -> Any | None:
+def carve_reference(views: Views, domain: VisibleDomain | None = None) -> Hull | None:
     """The hull that `outside_hull_mass` is measured against: the default visible domain of these views.
 
     The same for every method and variant. None, with a warning, when it is empty, and when no view has a mask.
     """
-    from visdom_plugin.hull.domain import VisibleDomain
-
     if not views.has_masks:
         return None
     try:
@@ -131,7 +144,7 @@ def carve_reference(views: Views, domain: Any = None) -> Any | None:
         return None
 
 
-def hull_silhouette(hull: Any, camera: Cameras) -> Tensor:
+def hull_silhouette(hull: Hull, camera: Cameras) -> Tensor:
     """(H, W) bool, True where a pixel's ray meets the hull."""
     from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 

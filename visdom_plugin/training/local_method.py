@@ -12,9 +12,10 @@ from torch import Tensor
 from visdom_plugin.errors import CheckpointError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.geometry.local_frame import local_origin
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
-from visdom_plugin.training.protocols import Method, StepOutput
+from visdom_plugin.training.protocols import Batch, Hook, Method, StepOutput
 
 ORIGIN = "frame.origin"
 """Key of the frame's origin in a checkpoint; not there where the frame is the world's own."""
@@ -37,11 +38,11 @@ class LocalMethod:
         return getattr(self.__dict__["method"], name)
 
     def setup(
-        self, views: Views, hooks: Sequence[Any], *, hull: Any, device: torch.device, seed: int
+        self, views: Views, hooks: Sequence[Hook], *, hull: Hull | None, device: torch.device, seed: int
     ) -> None:
         self.method.setup(views, hooks, hull=hull, device=device, seed=seed)
 
-    def train_step(self, batch: Any, step: int) -> StepOutput:
+    def train_step(self, batch: Batch, step: int) -> StepOutput:
         return self.method.train_step(batch, step)
 
     def optimise(self, step: int, output: StepOutput) -> None:

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
 log = logging.getLogger(__name__)
+
+PerceptualDistance: TypeAlias = Callable[[Tensor, Tensor], Tensor]
+"""Two images (1, 3, H, W) in [-1, 1] to their distance, a scalar."""
 
 SILHOUETTE_ALPHA = 0.5
 PROTOCOL = {"background": "white", "definition": 1}
@@ -98,7 +102,7 @@ def compare(
     mask: Tensor,
     *,
     hull_silhouette: Tensor | None = None,
-    perceptual: Any = None,
+    perceptual: PerceptualDistance | None = None,
     ignore: Tensor | None = None,
 ) -> dict[str, float]:
     """All metrics of one view.
@@ -159,14 +163,14 @@ def mean_over_views(rows: list[dict[str, float]]) -> dict[str, float]:
     return means
 
 
-def lpips(network: Any, x: Tensor, y: Tensor) -> float:
+def lpips(network: PerceptualDistance, x: Tensor, y: Tensor) -> float:
     """LPIPS-VGG (Zhang et al. 2018) of two images (H, W, 3) in [0, 1], in the network's own range [-1, 1]."""
     with torch.no_grad():
         pair = [(2 * image.float() - 1).permute(2, 0, 1)[None] for image in (x, y)]
         return float(network(*pair))
 
 
-def load_lpips() -> Any | None:
+def load_lpips() -> PerceptualDistance | None:
     """The LPIPS network, or None, with a message that says what is missing.
 
     The weights of its backbone must already be on this machine; nothing is downloaded.

@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal, TypeVar, overload
 
 import torch
 from torch import Tensor
@@ -28,6 +28,7 @@ from visdom_plugin.scene import NO_MASKS, MaskOrigin, Scene, Views
 log = logging.getLogger(__name__)
 
 Way = Literal["error", "colour", "hull"]
+Item = TypeVar("Item")
 
 
 def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> Scene:
@@ -102,7 +103,9 @@ def _filled(views: Views, outlines: dict[int, Tensor], way: MaskOrigin) -> Views
     filled = replace(views, masks=_Replaced(views.masks, outlines), mask_origins=origins)
     if way != "colour":
         return filled
-    beside = {i: _either(~outline, views.ignored(i)) for i, outline in outlines.items()}
+    beside: dict[int, Tensor | None] = {
+        i: _either(~outline, views.ignored(i)) for i, outline in outlines.items()
+    }
     return replace(filled, ignore=_Replaced(views.ignore or (None,) * len(views), beside))
 
 
@@ -110,16 +113,22 @@ def _either(one: Tensor, other: Tensor | None) -> Tensor:
     return one if other is None else one | torch.as_tensor(other)
 
 
-class _Replaced(Sequence[Any]):
+class _Replaced(Sequence[Item]):
     """A sequence with some items replaced, the others not looked at before they are asked for."""
 
-    def __init__(self, base: Sequence[Any], changed: Mapping[int, Tensor]):
+    def __init__(self, base: Sequence[Item], changed: Mapping[int, Item]):
         self._base, self._changed = base, changed
 
     def __len__(self) -> int:
         return len(self._base)
 
-    def __getitem__(self, index: Any) -> Any:
+    @overload
+    def __getitem__(self, index: int) -> Item: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Item, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> Item | tuple[Item, ...]:
         if isinstance(index, slice):
             return tuple(self[i] for i in range(*index.indices(len(self))))
         index = range(len(self))[index]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import torch
 from torch import Tensor
@@ -76,6 +76,12 @@ class StepOutput:
         return reduce(torch.add, self.losses.values())
 
 
+Batch: TypeAlias = Any
+"""A `ViewBatch`, or a `PixelBatch`: a method takes one of the two."""
+Hook: TypeAlias = Any
+"""A `SamplerHook` or a `GaussianHook`: a method takes one of the two."""
+
+
 class Method(Protocol):
     """A reconstruction method. Constructed as `Method(config)`, where `config` is its plain dataclass.
 
@@ -85,6 +91,9 @@ class Method(Protocol):
     A method with a `pixels_per_step(step) -> int` is handed that many pixels of all views per step
     (`PixelBatch`), any other one a whole view (`ViewBatch`). The number may depend on the method's state, which
     then is part of `state_dict`.
+
+    A method with a `summary() -> dict[str, int]` has these numbers, {"gaussians": 6000}, shown while it trains
+    and noted in run.json's `model`.
 
     Fields of the config that have a meaning here: `mask_weight`, the weight of the silhouette loss; `hull`, what
     to carve; `vd`, the hook's settings. `visdom_plugin.specs.MethodSpec` adds them where a config lacks them.
@@ -98,7 +107,7 @@ class Method(Protocol):
     """Length of the schedule, 1 or more; the trainer calls steps 0 .. total_steps - 1."""
 
     def setup(
-        self, views: Views, hooks: Sequence[Any], *, hull: Hull | None, device: torch.device, seed: int
+        self, views: Views, hooks: Sequence[Hook], *, hull: Hull | None, device: torch.device, seed: int
     ) -> None:
         """Builds parameters and optimisers on `device` from the training views.
 
@@ -110,7 +119,7 @@ class Method(Protocol):
         """
         ...
 
-    def train_step(self, batch: Any, step: int) -> StepOutput:
+    def train_step(self, batch: Batch, step: int) -> StepOutput:
         """The forward pass.
 
         The batch, a `ViewBatch` or `PixelBatch`, belongs to the trainer and stays as it is.

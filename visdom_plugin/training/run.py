@@ -9,30 +9,43 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Protocol
 
 import torch
 
 from visdom_plugin import registry
 from visdom_plugin.atomic_files import appearing, finite
 from visdom_plugin.errors import CheckpointError, ConfigError, EmptyHullError, PluginError, SceneError
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import Scene, Views
+from visdom_plugin.specs import Settings
 from visdom_plugin.training.evaluate import carve_reference, evaluate
 from visdom_plugin.training.local_method import LocalMethod, move_near
-from visdom_plugin.training.protocols import Method
+from visdom_plugin.training.progress import Progress
+from visdom_plugin.training.protocols import Batch, Hook, Method
 from visdom_plugin.training.runs import checkpoints
 from visdom_plugin.training.runs.config_io import as_plain, differences
-from visdom_plugin.training.runs.run_directory import RunDir, describe_data
+from visdom_plugin.training.runs.run_directory import Record, RunDir, describe_data
 from visdom_plugin.training.runs.saved_hulls import REFERENCE, find_hull, read_hull, write_hull
-from visdom_plugin.training.trainer import Trainer, view_psnr
-
-if TYPE_CHECKING:
-    from visdom_plugin.hull.hull import Hull
+from visdom_plugin.training.trainer import Trainer, summarise, view_psnr
+from visdom_plugin.training.training_views import draw_training_views, refuse_empty
 
 log = logging.getLogger(__name__)
 
-DataManager = Callable[[Views, int, torch.device], Any]
-"""(training views, seed, device) to an object whose `view_batch(step)` and `pixel_batch(step, n)` are pure."""
+
+class Batches(Protocol):
+    """What training draws of the views, pure functions of the step; `batches.DataManager` makes them."""
+
+    def view_batch(self, step: int) -> Batch:
+        """A whole view."""
+
+    def pixel_batch(self, step: int, n: int) -> Batch:
+        """`n` pixels of all views."""
+
+
+DataManager = Callable[[Views, int, torch.device], Batches]
+"""(training views, seed, device) to the batches."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -41,7 +54,7 @@ class Interrupted(KeyboardInterrupt):
 
 def train(
     preset_name: str,
-    config: Any,
+    config: Settings,
     scene: Scene,
     *,
     data_manager: DataManager,
@@ -51,9 +64,9 @@ def train(
     quiet: bool = False,
     overwrite: bool = False,
     checkpoint_seconds: float = 30,
-    request: dict[str, Any] | None = None,
+    request: Record | None = None,
     budget: str | None = None,
-) -> dict[str, Any]:
+) -> Record:
     """Trains, evaluates and writes the run directory; resumes the same run where it was left.
 
     Nothing made of `scene.test` reaches the hull, the hooks or the method: they are handed `scene.train`.
@@ -74,7 +87,7 @@ def train(
     """
     preset = registry.find(preset_name)
     device = torch.device(device)
-    if preset.hook == "gaussian" and config.hull is None:
+    if preset.hook == "gaussian" and getattr(config, "hull", None) is None:
         scene = replace(scene, train=replace(scene.train, points=scene.points))
     identity = {
         "method": preset.name,
@@ -110,7 +123,7 @@ def train(
 
 def _run(
     preset: registry.Preset,
-    config: Any,
+    config: Settings,
     scene: Scene,
     run: RunDir,
     data_manager: DataManager,
@@ -138,21 +151,23 @@ def _run(
     )
     if not trainer.run():
         raise Interrupted
-    began = time.monotonic()
-    found = assess(method, config, hull, scene, device=device, run_dir=run.path)
-    eval_s = time.monotonic() - began
     export(method, run.path / "export")
+    began = time.monotonic()
+    refuse_empty(method, scene.train, device, run.path)
+    found = assess(method, config, hull, scene, device=device, run_dir=run.path, quiet=quiet)
+    eval_s = time.monotonic() - began
     step_ms = 1000 * trainer.train_s / max(trainer.step, 1)
     run.record.pop("error", None)
     run.update(
         status="finished",
         timing={"hull_s": hull_s, "train_s": trainer.train_s, "eval_s": eval_s, "step_ms": step_ms},
         metrics=finite(found),
+        model=summarise(method),
     )
     return trainer.resumed_from
 
 
-def choose_batches(method: Method, batches: Any) -> Callable[[int], Any]:
+def choose_batches(method: Method, batches: Batches) -> Callable[[int], Batch]:
     """Whole views, or pixels for a method that says how many of them it wants."""
     pixels = getattr(method, "pixels_per_step", None)
     if pixels is None:
@@ -160,7 +175,7 @@ def choose_batches(method: Method, batches: Any) -> Callable[[int], Any]:
     return lambda step: batches.pixel_batch(step, pixels(step))
 
 
-def _warn_of_changes(before: dict[str, Any], now: dict[str, Any]) -> None:
+def _warn_of_changes(before: Record, now: Record) -> None:
     lines = differences({k: before[k] for k in now if k in before}, {k: now[k] for k in now if k in before})
     if lines:
         log.warning(
@@ -171,7 +186,7 @@ def _warn_of_changes(before: dict[str, Any], now: dict[str, Any]) -> None:
 
 def build(
     preset: registry.Preset,
-    config: Any,
+    config: Settings,
     views: Views,
     *,
     device: torch.device,
@@ -198,7 +213,7 @@ def build(
     return method, hull, hull_s
 
 
-def make_hooks(config: Any, hull: Any, views: Views) -> list[Any]:
+def make_hooks(config: Settings, hull: Hull | None, views: Views) -> list[Hook]:
     """The hook that the config's field `vd` asks for, in a list; none where it is off or not there.
 
     Raises:
@@ -217,8 +232,8 @@ def make_hooks(config: Any, hull: Any, views: Views) -> list[Any]:
 
 
 def restore(
-    preset: registry.Preset, config: Any, views: Views, path: Path, *, device: torch.device, seed: int
-) -> tuple[Method, Any, int]:
+    preset: registry.Preset, config: Settings, views: Views, path: Path, *, device: torch.device, seed: int
+) -> tuple[Method, Hull | None, int]:
     """The method in the state of a run directory's newest checkpoint, its hull, and that step.
 
     Raises:
@@ -235,27 +250,51 @@ def restore(
 
 
 def assess(
-    method: Method, config: Any, hull: Hull | None, scene: Scene, *, device: torch.device, run_dir: Path
-) -> dict[str, Any]:
-    """Metrics and pictures of the test views; see `evaluate`.
+    method: Method,
+    config: Settings,
+    hull: Hull | None,
+    scene: Scene,
+    *,
+    device: torch.device,
+    run_dir: Path,
+    quiet: bool = False,
+) -> Record:
+    """Metrics and pictures of the test views, see `evaluate`; without any, `draw_training_views`.
 
     The reference hull is carved once per run and kept as hull/reference.npz, unless the method's own is the same.
     """
-    from visdom_plugin.hull.domain import VisibleDomain
-
-    reference: Hull | None
-    if hull is not None and config.hull == VisibleDomain():
+    views, folder = scene.test, run_dir / "renders"
+    reference: Hull | None = None
+    if not len(views):
+        draw_training_views(method, scene.train, hull, device=device, folder=folder, quiet=quiet)
+    elif hull is not None and getattr(config, "hull", None) == VisibleDomain():
         reference = hull
     elif (reference := read_hull(run_dir / "hull" / REFERENCE)) is None:
+        log.info("the metric 'opacity outside the hull' needs the hull that is the same for every method:")
         reference = carve_reference(scene.train)
         if reference is not None:
             reference.save(run_dir / "hull" / REFERENCE)
-    return evaluate(method, scene.test, reference_hull=reference, device=device, folder=run_dir / "renders")
+    if len(views):
+        size = f"{int(views.cameras.width[0])} x {int(views.cameras.height[0])}"
+        log.info("evaluation: %d test views of %s pixels, the size of training", len(views), size)
+    with Progress(
+        len(views), title="evaluation", unit="test view", quiet=quiet or not len(views)
+    ) as progress:
+        return evaluate(
+            method, views, reference_hull=reference, device=device, folder=folder, progress=progress
+        )
 
 
 def evaluate_again(
-    method: Method, config: Any, hull: Any, scene: Scene, *, device: torch.device, run_dir: Path
-) -> dict[str, Any]:
+    method: Method,
+    config: Settings,
+    hull: Hull | None,
+    scene: Scene,
+    *,
+    device: torch.device,
+    run_dir: Path,
+    quiet: bool = False,
+) -> Record:
     """Measures a restored method and puts the result into its run.json, which is returned.
 
     Raises:
@@ -263,7 +302,7 @@ def evaluate_again(
     """
     with RunDir.open_existing(run_dir) as run:
         began = time.monotonic()
-        found = assess(method, config, hull, scene, device=device, run_dir=run.path)
+        found = assess(method, config, hull, scene, device=device, run_dir=run.path, quiet=quiet)
         timing = run.record.get("timing", {}) | {"eval_s": time.monotonic() - began}
         run.update(metrics=finite(found), timing=timing)
         return run.record

@@ -7,15 +7,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import FrameType
 
 import torch
 
 from visdom_plugin.errors import PluginError, VisDomError
 from visdom_plugin.render import quantise
+from visdom_plugin.scene import Views
 from visdom_plugin.training import metrics
 from visdom_plugin.training.progress import Progress
-from visdom_plugin.training.protocols import Method, StepOutput
+from visdom_plugin.training.protocols import Batch, Method, StepOutput
 from visdom_plugin.training.runs import checkpoints
 from visdom_plugin.training.runs.run_directory import RunDir
 
@@ -39,7 +40,7 @@ class Trainer:
     def __init__(
         self,
         method: Method,
-        batch_of: Callable[[int], Any],
+        batch_of: Callable[[int], Batch],
         run: RunDir,
         *,
         device: torch.device,
@@ -97,11 +98,12 @@ class Trainer:
                     psnr = self._measure_psnr(output, log_every)
                     row = {"step": self.step, "loss": loss}
                     row |= {f"loss_{k}": float(v.detach()) for k, v in output.losses.items()}
+                    row |= summarise(self.method)
                     self.run_dir.log(row | {"psnr": psnr, "train_s": round(self.train_s, 3)})
                 if save:
                     self._save()
                     saved = time.monotonic()
-                progress.show(self.step, loss, psnr)
+                progress.show(self.step, loss, psnr, summarise(self.method))
         if self.stopped and self.step < total:
             self._save()
             return False
@@ -146,7 +148,12 @@ class Trainer:
         self.stopped = True
 
 
-def _check_output(output: Any, method: Method) -> StepOutput:
+def summarise(method: Method) -> dict[str, int]:
+    """What a method says of its model as it is now, {"gaussians": 6000}; nothing where it has no `summary`."""
+    return getattr(method, "summary", dict)()
+
+
+def _check_output(output: object, method: Method) -> StepOutput:
     if isinstance(output, StepOutput):
         return output
     raise PluginError(
@@ -164,7 +171,7 @@ def _signals(stop: Callable[[], None]) -> Iterator[None]:
         yield
         return
 
-    def handle(number: int, frame: Any) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         stop()
 
@@ -176,7 +183,7 @@ def _signals(stop: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def view_psnr(method: Method, views: Any, device: torch.device) -> Callable[[int], float]:
+def view_psnr(method: Method, views: Views, device: torch.device) -> Callable[[int], float]:
     """PSNR on white of one training view, another for every call's step."""
     from visdom_plugin.training.evaluate import render_on_white
 

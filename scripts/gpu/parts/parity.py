@@ -335,7 +335,7 @@ def _raster_case(count: int, size: int):
         for device in ("cpu", bench.device):
             one = subjects.gaussians(count).to(device)
             parameters = [p.requires_grad_() for p in one.tensors().values()]
-            render = project.rasterise(one, camera.to(device), background)
+            render = project.rasterise(one, camera.to(device), background, near=0.01)
             (render.rgb.square().sum() + render.alpha.sum() + render.depth.sum()).backward()
             slopes = [p.grad for p in parameters] + [render.info["means2d"].grad]
             results.append(((render.rgb, render.alpha, render.depth), slopes))

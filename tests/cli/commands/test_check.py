@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shutil
 import subprocess
 import sys
 
@@ -13,6 +14,7 @@ import torch
 from datamodules import load
 from tests.datamodules.layouts.prepared_writer import write_prepared
 from tests.hull.checks.faults import FAULTS, capture_of
+from visdom_plugin.cli.commands import train
 from visdom_plugin.cli.commands.check import check_views, main, warn_of_faults
 from visdom_plugin.figures.check_sheet import draw_check
 from visdom_plugin.scene import Scene, Views
@@ -30,8 +32,6 @@ def folder(sound, tmp_path_factory):
 
 def spoil(folder, tmp_path, change):
     """A copy of the scene with the second training view's mask file changed."""
-    import shutil
-
     copy = tmp_path / "scene"
     shutil.copytree(folder, copy)
     path = copy / "masks" / "train_001.png"
@@ -132,8 +132,23 @@ def test_training_is_warned(sound, caplog):
     with caplog.at_level(logging.WARNING):
         warn_of_faults(scene_of(capture))
         assert caplog.text == ""
-        warn_of_faults(scene_of(FAULTS["inverted"](capture, 2).capture))
-    assert "train_002" in caplog.text and "certain" in caplog.text and "what to do" in caplog.text
+        warn_of_faults(scene_of(FAULTS["same_view"](capture, 2).capture))
+    assert "certain" in caplog.text and "what to do" in caplog.text
+
+
+def test_masks_that_are_certainly_inverted_stop_training_and_can_be_turned_over(folder, tmp_path, capsys):
+    spoilt = tmp_path / "spoilt"
+    shutil.copytree(folder, spoilt)
+    for path in (spoilt / "masks").iterdir():
+        cv2.imwrite(str(path), 255 - cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+    run = ["method:ingp", "--data", str(spoilt), "--out", str(tmp_path / "run"), "--quiet"]
+    assert train.main(run) == 2
+    error = capsys.readouterr().err
+    assert "all masks are foreground along most" in error and "or pass --invert-masks" in error
+    assert not (tmp_path / "run").exists()
+    assert main([str(spoilt), "--invert-masks", "--quiet"]) == main([str(folder), "--quiet"]) == 0
+    assert train.main([*run[:2], str(folder), *run[3:], "--invert-masks"]) == 2
+    assert "leave out --invert-masks" in capsys.readouterr().err
 
 
 def test_help_needs_no_heavy_import():

@@ -59,8 +59,13 @@ def test_another_command_on_the_same_directory_is_refused_with_the_way_out(train
         "error: the run directory holds another run (there -> now):",
         "    config.lr: 0.05 -> 0.5",
         "  where: run",
-        "  what to do: choose another directory with --out, or replace what is there with --overwrite",
+        "  what to do: --out run-2 keeps both, --overwrite replaces what is there",
     ]
+    assert train.main([*TRAIN[:-1], "run-2", "--method.lr", "0.5", "--quiet"]) == 0
+    assert train.main([*TRAIN, "--method.lr", "0.25"]) == 2 and "--out run-3 keeps" in capsys.readouterr().err
+    assert train.main([*TRAIN, "--downscale", "2"]) == 2
+    error = capsys.readouterr().err
+    assert "data.downscale: 1.0 -> 2.0" in error and "hashes" not in error
     assert train.main([*TRAIN, "--method.lr", "0.5", "--overwrite", "--quiet"]) == 0
 
 
@@ -185,7 +190,7 @@ def test_what_cannot_be_rendered_is_said_before_anything_is(trained, capsys, mon
 
 def test_the_path_between_views_begins_and_ends_at_views():
     scene = fake.tiny_scene()
-    cameras = render.choose_cameras("between", 7, scene, None)
+    cameras = render.cameras_along("between", 7, scene, None)
     ends = scene.train.cameras.world_from_camera[[0, -1]]
     assert (cameras.world_from_camera[[0, -1]] - ends).abs().max() < 1e-9 and len(cameras) == 7
 

@@ -29,9 +29,9 @@ def test_pictures_are_those_of_the_rasteriser(cloud, path, count, capsys):
     pictures = sorted(folder.iterdir())
     assert [p.name for p in pictures] == [f"{i:04d}.png" for i in range(count)]
     scene = load(None, views=3, downscale=4, seed=0)
-    cameras = render.choose_cameras(path, 2, scene, None)
+    cameras = render.cameras_along(path, 2, scene, None)
     for i, picture in enumerate(pictures):
-        drawn = rasterise(read_ply(cloud), cameras[i], torch.ones(3)).rgb
+        drawn = rasterise(read_ply(cloud), cameras[i], torch.ones(3), near=0.01).rgb
         assert np.array_equal(read_png(picture), to_bytes(drawn))
         assert read_png(picture).std() > 1
 
@@ -44,7 +44,7 @@ def test_a_cloud_far_from_the_origin_looks_the_same(cloud, far):
     write_gaussians(cloud, near, shift)
     moved = cameras.relative_to(-shift)
     origin = local_origin(moved)
-    there = render.PointCloud(read_ply(cloud, origin), origin)
+    there = render.PointCloud(read_ply(cloud, origin), origin, near=0.01)
     white = torch.ones(3)
     for i in range(len(cameras)):
         drawn, wanted = there.render(moved[i], white), rasterise(near, cameras[i], white)

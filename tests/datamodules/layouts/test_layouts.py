@@ -163,6 +163,7 @@ def test_the_standard_split_and_even_spreading_are_said(free, tmp_path, caplog):
     for views in (0, 8):
         with pytest.raises(SceneError, match="7 of the 9 views"):
             load(folder, views=views)
+    assert len(load(folder, views=9).train) == 9
 
 
 def test_lists_by_hand_are_positions_names_or_a_file(free, tmp_path):

@@ -41,19 +41,36 @@ def test_training_views_are_the_same_whether_test_views_are_asked_for_or_not(
 def test_who_needs_no_test_view_gets_all_views_but_those_listed_for_testing(count, tmp_path):
     names, pools = _names(count), every_eighth(range(count))
     found = choose(tmp_path, names, Request(views=count, test=False), pools)
-    assert found.train == list(range(count)) and "no view is held out" in found.rule
-    with pytest.raises(SceneError, match=f"{count + 1} training views are wanted"):
-        choose(tmp_path, names, Request(views=count + 1, test=False), pools)
+    assert found.train == list(range(count)) and f"all {count} views train" in found.rule
     (tmp_path / "sparse_test.txt").write_text("1")
     assert 1 not in choose(tmp_path, names, Request(views=count - 1, test=False), pools).train
-    with pytest.raises(SceneError, match=f"{count} training views are wanted"):
-        choose(tmp_path, names, Request(views=count, test=False), pools)
+    assert 1 not in choose(tmp_path, names, Request(views=count, test=False), pools).train
 
 
-def test_the_advice_to_list_all_views_works(tmp_path):
-    names, pools = _names(4), every_eighth(range(4))
-    with pytest.raises(SceneError, match="3 of the 4 views are for training") as caught:
-        choose(tmp_path, names, Request(views=4), pools)
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_as_few_views_as_are_wanted_all_train(count, tmp_path):
+    names, pools = _names(count), every_eighth(range(count))
+    for request in (Request(), Request(views=4), Request(views=count), Request(views=4, hold_out=False)):
+        found = choose(tmp_path, names, request, pools)
+        assert found.train == list(range(count)) and found.test == []
+    if count > 1:
+        listed = choose(tmp_path, names, Request(views=4, test_list="0"), pools)
+        assert listed.train == list(range(1, count)) and listed.test == [0]
+
+
+def test_all_views_can_be_asked_for_in_a_word(tmp_path):
+    names, pools = _names(9), every_eighth(range(9))
+    found = choose(tmp_path, names, Request(views=4, train_list="all"), pools)
+    assert found.train == list(range(9)) and found.test == []
+    found = choose(tmp_path, names, Request(train_list="all", test_list="v02,5"), pools)
+    assert found.train == [0, 1, 3, 4, 6, 7, 8] and found.test == [2, 5]
+    assert len(choose(tmp_path, names, Request(views=4), pools).test) == 2
+
+
+def test_the_advice_to_list_views_that_test_works(tmp_path):
+    names, pools = _names(10), every_eighth(range(10))
+    with pytest.raises(SceneError, match="8 of the 10 views are for training") as caught:
+        choose(tmp_path, names, Request(views=9), pools)
     listed = re.search(r"--train-list (\S+)", caught.value.todo).group(1)
-    assert choose(tmp_path, names, Request(train_list=listed), pools).train == [0, 1, 2, 3]
-    assert "--leave-one-out" in caught.value.todo and "--views with 1 to 3" in caught.value.todo
+    assert len(choose(tmp_path, names, Request(train_list=listed), pools).train) == 9
+    assert "--views with 1 to 8" in caught.value.todo

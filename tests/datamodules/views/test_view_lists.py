@@ -70,3 +70,11 @@ def test_names_with_blanks_and_a_byte_order_mark_are_read_from_files(encoding, t
     assert _of_file(tmp_path, "été plain.png", SPACED, encoding) == [3, 2]
     with pytest.raises(ConfigError, match="'my view 9'"):
         _of_file(tmp_path, "plain\nmy view 9", SPACED, encoding)
+
+
+def test_names_may_lack_folder_and_ending_where_one_view_is_meant():
+    names = ["images/a.png", "images/b.JPG", "left/c.png", "right/c.png"]
+    assert read_list("b,a.png,left/c", names, "--train-list") == [1, 0, 2]
+    for word in ("c", "c.png"):
+        with pytest.raises(ConfigError, match=f"names '{word}', which is no view"):
+            read_list(f"a,{word}", names, "--train-list")

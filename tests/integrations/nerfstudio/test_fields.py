@@ -66,19 +66,19 @@ def test_background_is_random_in_training_and_white_after():
     )
 
 
-def test_silhouette_loss_is_the_cross_entropy():
+def test_rgba_mask_loss_is_the_cross_entropy():
     opacity, photograph = torch.rand(50, 1) * 0.9 + 0.05, torch.rand(50, 4).round()
-    loss = fields.silhouette_loss(opacity, photograph)
+    loss = fields.rgba_mask_loss(opacity, photograph)
     by_hand = [
         -np.log(a) if m else -np.log(1 - a)
         for a, m in zip(opacity[:, 0].tolist(), photograph[:, 3], strict=True)
     ]
     assert loss.item() == pytest.approx(np.mean(by_hand), rel=1e-5)
     with pytest.raises(ConfigError, match="without"):
-        fields.silhouette_loss(opacity, photograph[:, :3])
+        fields.rgba_mask_loss(opacity, photograph[:, :3])
 
 
-def test_silhouette_loss_leaves_mixed_precision(monkeypatch):
+def test_rgba_mask_loss_leaves_mixed_precision(monkeypatch):
     """On CUDA torch raises for a cross entropy of probabilities under autocast."""
     plain, seen = fields.mask_loss, []
 
@@ -88,7 +88,7 @@ def test_silhouette_loss_leaves_mixed_precision(monkeypatch):
 
     monkeypatch.setattr(fields, "mask_loss", watched)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        fields.silhouette_loss(torch.rand(5, 1).bfloat16(), torch.rand(5, 4).round())
+        fields.rgba_mask_loss(torch.rand(5, 1).bfloat16(), torch.rand(5, 4).round())
     assert seen == [(False, torch.float32, torch.float32)]
 
 
@@ -145,7 +145,7 @@ def test_samples_of_training_rays_lie_in_the_hulls_band(train, batch):
     outputs, losses = step(model, train, batch)
     assert "mask_loss" in losses
     assert losses["mask_loss"].item() == pytest.approx(
-        0.1 * fields.silhouette_loss(outputs["accumulation"], batch["image"]).item()
+        0.1 * fields.rgba_mask_loss(outputs["accumulation"], batch["image"]).item()
     )
     hook, frame = model.collider.hook, model.collider.frame
     bundle = model.collider(pixel_rays(train)[batch["chosen"]])

@@ -225,7 +225,7 @@ def test_co_pruning_removes_strays_of_either_set_and_never_a_whole_set(scene, hu
     method = start(scene, hull, config, hooks=[])
     first, second = method.sets
     n = len(first)
-    means = [one.means.clone() for one in method.sets]
+    means = [one.gaussians().means.detach().clone() for one in method.sets]
     means[0][3] += 50
     means[1][7] -= 50
     for one, x in zip(method.sets, means, strict=True):
@@ -234,7 +234,7 @@ def test_co_pruning_removes_strays_of_either_set_and_never_a_whole_set(scene, hu
     # A stray's old partner has others nearby; the strays themselves have none.
     assert len(first) == len(second) == n - 1
     assert float(first.means.abs().max()) < 40 and float(second.means.abs().max()) < 40
-    second.optimiser.overwrite("means", second.means + 100)
+    second.optimiser.overwrite("means", second.gaussians().means.detach() + 100)
     method._co_prune(20)
     assert len(first) == len(second) == n - 1
 
@@ -252,7 +252,7 @@ def test_the_threshold_scales_with_the_scene_unless_it_is_in_world_units(scene, 
         for views in (scene.train, larger):
             method = CorgsLite(replace(config, initial_cloud="random"))
             method.setup(views, [], hull=None, device=CPU, seed=0)
-            distances.append(method.co_prune_distance)
+            distances.append(method.co_prune_distance * method.unit)
         assert distances[1] == pytest.approx(factor * distances[0])
 
 

@@ -91,7 +91,7 @@ def test_a_hook_that_adds_nothing_changes_nothing(scene, hull):
     config = replace(SMALL, vd=RegularizerConfig())
     plain = start(scene, hull, config, hooks=[])
     p = plain.splats.optimiser.parameters
-    xyz, rgb = p["means"].detach().clone(), (p["sh_dc"].detach()[:, 0] * 0.28209479177387814 + 0.5)
+    xyz, rgb = plain.splats.means, (p["sh"].detach()[:, 0] * 0.28209479177387814 + 0.5)
     twin = start(scene, hull, config, hooks=[Bystander((xyz, rgb))])
     twin.load_state_dict({k: v.clone() for k, v in plain.state_dict().items()})
     advance(plain, scene, range(40))

@@ -38,6 +38,7 @@ OWN = {
     GsGoConfig: {
         "depth_weight": -1.0,
         "prune_large_from": -1,
+        "prune_radius": 0.0,
         "prune_radius_px": 0.0,
         "prune_scale": 0.0,
         "opacity_reset_every": -1,

@@ -69,7 +69,7 @@ def _main(argv: Sequence[str]) -> int:
     loaded = time.perf_counter()
     k = None if options.k == "auto" else options.k
     found = check_views(views, masks, k=k, layout=scene.source.get("layout"))
-    report = {"scene": scene.name, **describe_check(found, views.names)}
+    report = {"scene": scene.name, **describe_check(found, views.names, inverted=options.invert_masks)}
     report["seconds"] = {
         "load": round(loaded - started, 3),
         "check": round(time.perf_counter() - loaded, 3),
@@ -87,8 +87,15 @@ def _main(argv: Sequence[str]) -> int:
     return FOUND if found.findings else 0
 
 
-def warn_of_faults(scene: Scene) -> None:
-    """A brief check before training: every finding as one warning on the log; never stops anything."""
+def warn_of_faults(scene: Scene, *, inverted: bool = False) -> None:
+    """A brief check before training: every finding as one warning on the log.
+
+    Args:
+        inverted: whether the masks were turned over as they were read.
+
+    Raises:
+        SceneError: masks are certainly inverted; what would be trained is the background.
+    """
     import logging
 
     log = logging.getLogger(__name__)
@@ -96,7 +103,17 @@ def warn_of_faults(scene: Scene) -> None:
         return
     views, masks = carving_views(scene.train)
     for f in check_views(views, masks, brief=True, layout=scene.source.get("layout")).findings:
-        log.warning("%s (%s); what to do: %s; `visdom-check` tells more", f.what, f.sure, f.todo)
+        todo = _advise(f, len(views), inverted)
+        if f.kind == "inverted" and f.sure == "certain":
+            raise SceneError(f.what, where=scene.name, cause="masks that are black on the object", todo=todo)
+        log.warning("%s (%s); what to do: %s; `visdom-check` tells more", f.what, f.sure, todo)
+
+
+def _advise(finding: Finding, views: int, inverted: bool) -> str:
+    """What to do about a finding, with the option that does it where there is one."""
+    if finding.kind != "inverted" or len(finding.views) < views:
+        return finding.todo
+    return "leave out --invert-masks" if inverted else f"{finding.todo}; or pass --invert-masks"
 
 
 def carving_views(views: Views) -> tuple[Views, list]:
@@ -124,14 +141,14 @@ def check_views(
     return check(views.cameras, masks, images, views.names, k=k, brief=brief, poses=poses, set_k=IN_COMMANDS)
 
 
-def describe_check(found: Check, names: Sequence[str]) -> dict[str, Any]:
+def describe_check(found: Check, names: Sequence[str], *, inverted: bool = False) -> dict[str, Any]:
     """What a check of views with these names found, as plain numbers, strings and lists."""
     usable = [names[i] for i in found.usable]
     report: dict[str, Any] = {
         "views": list(names),
         "clean": not found.findings,
-        "findings": [_plain(f, names) for f in found.findings],
-        "notes": [_plain(f, names) for f in found.notes],
+        "findings": [_plain(f, names, inverted) for f in found.findings],
+        "notes": [_plain(f, names, inverted) for f in found.notes],
     }
     if found.advice is not None:
         report["k"] = found.advice.k
@@ -148,14 +165,14 @@ def describe_check(found: Check, names: Sequence[str]) -> dict[str, Any]:
     return report
 
 
-def _plain(finding: Finding, names: Sequence[str]) -> dict[str, Any]:
+def _plain(finding: Finding, names: Sequence[str], inverted: bool) -> dict[str, Any]:
     return {
         "kind": finding.kind,
         "what": finding.what,
         "views": [names[i] for i in finding.views],
         "sure": finding.sure,
         "evidence": round(float(finding.evidence), 6),
-        "todo": finding.todo,
+        "todo": _advise(finding, len(names), inverted),
     }
 
 

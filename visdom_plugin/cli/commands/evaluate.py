@@ -39,9 +39,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _evaluate(argv: Sequence[str]) -> int:
     if read_early(argv).leave_one_out:
-        from visdom_plugin.cli.evaluation.leave_one_out import leave_one_out
+        from visdom_plugin.cli.evaluation import leave_one_out
 
-        return leave_one_out([word for word in argv if word != "--leave-one-out"])
+        return leave_one_out.main([word for word in argv if word != "--leave-one-out"])
     options = tyro.cli(Options, args=argv, prog="visdom-eval")
 
     from visdom_plugin.cli.report import say, show_result
@@ -51,8 +51,9 @@ def _evaluate(argv: Sequence[str]) -> int:
     record, config, scene, method, hull, device, step = open_run(options.run, options.data, options.device)
     if record["status"] != "finished" and not options.quiet:
         say(f"the run is {record['status']}: this is its state after {step} steps")
-    record = evaluate_again(method, config, hull, scene, device=device, run_dir=options.run)
-    if not options.quiet:
+    quiet = options.quiet
+    record = evaluate_again(method, config, hull, scene, device=device, run_dir=options.run, quiet=quiet)
+    if not quiet:
         show_result(record, options.run)
     return 0
 

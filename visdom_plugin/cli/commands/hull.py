@@ -167,9 +167,9 @@ def report_hull(
         hull.write_ply(out) if out.suffix == ".ply" else hull.save(out)
         report["out"] = str(out)
     if masks is not None:
-        from visdom_plugin.cli.hulls.hull_masks import choose_cameras, write_masks
+        from visdom_plugin.cli.hulls.hull_masks import mask_cameras, write_masks
 
-        seen_by, files = choose_cameras(masks.cameras, scene, hull, masks.frames)
+        seen_by, files = mask_cameras(masks.cameras, scene, hull, masks.frames)
         orbit = masks.cameras == "orbit"
         write_masks(hull, seen_by, files, masks.folder, poses=orbit, overwrite=masks.overwrite)
         report["masks_out"] = {"folder": str(masks.folder), "cameras": masks.cameras, "count": len(files)}

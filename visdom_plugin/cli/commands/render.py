@@ -81,7 +81,7 @@ def _render(argv: Sequence[str]) -> None:
     from visdom_plugin.training.evaluate import render_on_white
 
     scene, method, hull, device = (open_point_cloud if options.is_ply else open_trained)(options)
-    cameras = choose_cameras(options.path, options.frames, scene, hull)
+    cameras = cameras_along(options.path, options.frames, scene, hull)
     target = options.out or default_target(options)
     if options.format == "png":
         clear_numbered(target, len(cameras), ours=options.out is None)
@@ -141,8 +141,10 @@ def open_point_cloud(options: Options) -> Subject:
 
     from visdom_plugin.cli.report import say
     from visdom_plugin.cli.scenes import open_scene
+    from visdom_plugin.geometry.cameras import mean_distance
     from visdom_plugin.geometry.local_frame import local_origin
     from visdom_plugin.splat.ply import read_ply
+    from visdom_plugin.splat.rasterise import NEAR
 
     device = torch.device(resolve_device(options.device))
     reading = read_options(options) | {"missing_masks": "colour"}
@@ -153,7 +155,12 @@ def open_point_cloud(options: Options) -> Subject:
     if not options.quiet:
         whose = " (--data DIR names another scene)" if options.data is None else ""
         say(f"{len(gaussians)} Gaussians seen by the cameras of {scene.name}{whose}")
-    return scene, PointCloud(gaussians, origin), None, device
+    return (
+        scene,
+        PointCloud(gaussians, origin, NEAR * float(mean_distance(scene.train.cameras))),
+        None,
+        device,
+    )
 
 
 @dataclass(frozen=True)
@@ -163,12 +170,14 @@ class PointCloud:
     gaussians: Gaussians
     origin: Tensor
     """(3,) float64 of their frame, in the cameras' frame."""
+    near: float
+    """Where pictures begin, see `splat.rasterise`."""
 
     def render(self, camera: Cameras, background: Tensor) -> Render:
         """Their picture; `splat.rasterise` has the details."""
         from visdom_plugin.splat.rasterise import rasterise
 
-        return rasterise(self.gaussians, camera.relative_to(self.origin), background)
+        return rasterise(self.gaussians, camera.relative_to(self.origin), background, near=self.near)
 
 
 def default_target(options: Options) -> Path:
@@ -200,7 +209,7 @@ def clear_numbered(folder: Path, count: int, *, ours: bool) -> None:
         picture.unlink()
 
 
-def choose_cameras(path: str, frames: int, scene: Scene, hull: Hull | None) -> Cameras:
+def cameras_along(path: str, frames: int, scene: Scene, hull: Hull | None) -> Cameras:
     """(frames,) cameras of a path; the views' own for "train" and "test".
 
     Raises:

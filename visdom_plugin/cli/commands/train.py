@@ -37,7 +37,7 @@ def _train(argv: Sequence[str]) -> None:
         for line in (*describe_masks(scene.train), *scene.notes):
             say(f"data: {line}")
         say(f"run directory: {folder}")
-        warn_of_faults(scene)
+    warn_of_faults(scene, inverted=common.invert_masks)
     record = train_as_asked(request, scene, folder, device)
     if not common.quiet:
         if record["already_finished"]:

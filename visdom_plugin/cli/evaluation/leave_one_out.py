@@ -73,7 +73,7 @@ class Summary(Averages):
     """View to why the run without it failed."""
 
 
-def leave_one_out(argv: Sequence[str]) -> int:
+def main(argv: Sequence[str]) -> int:
     """The command; returns the exit status."""
     early = read_early(argv)
     named = bool(early.methods or early.config)

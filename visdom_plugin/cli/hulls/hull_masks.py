@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from visdom_plugin.scene import Scene
 
 
-def choose_cameras(which: str, scene: Scene, hull: Hull, frames: int) -> tuple[Cameras, list[str]]:
+def mask_cameras(which: str, scene: Scene, hull: Hull, frames: int) -> tuple[Cameras, list[str]]:
     """Cameras to see the hull with, and a file name without ending for each.
 
     Args:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from visdom_plugin.cli.table_parts.table_data import DataHasher, tidy_reading
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.tables.run.jobs import Resolved, Workshop
+from visdom_plugin.tables.spec import list_tables, load_table
 
 log = logging.getLogger(__name__)
 
@@ -34,17 +35,21 @@ def make_workshop(device: str = "auto", executor: str | None = None) -> Workshop
     )
 
 
+def list_not_built() -> set[str]:
+    """Methods that shipped tables name and that are not built here."""
+    return {method for name in list_tables() for method in load_table(name).not_built}
+
+
 def _refuse_misspelt(method: str, known: Sequence[str]) -> None:
     """Tells a misspelt method from one that is not installed, whose rows stay empty.
 
     Raises:
         ConfigError: for a name that is nearly a known one, or an unknown variant of a known one.
     """
-    from method_configs.not_built import NOT_BUILT
-
-    if method in NOT_BUILT:
+    not_built = list_not_built()
+    if method in not_built:
         return
-    by_lower = {name.lower(): name for name in (*known, *NOT_BUILT)}
+    by_lower = {name.lower(): name for name in (*known, *not_built)}
     base = method.lower().partition("+")[0]
     near = difflib.get_close_matches(method.lower(), by_lower, 1, MISSPELT) or [base]
     if near[0] in by_lower:

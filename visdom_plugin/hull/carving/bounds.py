@@ -74,7 +74,7 @@ def find_region(cameras: Cameras, search: Search) -> Region | None:
     """
     centre = look_at_point(cameras.to("cpu", dtype=torch.float64)).numpy()
     reach = float((cameras.centres.double().cpu() - torch.from_numpy(centre)).norm(dim=-1).max())
-    reach = max(reach, 1e-6)
+    reach = reach or 1e-6
     first = None
     for doubling in range(_DOUBLINGS + 1):
         half = 2.0 * reach * 2**doubling

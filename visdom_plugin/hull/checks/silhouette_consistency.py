@@ -211,8 +211,8 @@ def march_rays(
     offsets = np.concatenate([[0], np.cumsum(sizes.prod(1))[:-1]]).astype(np.int64)
     fields = np.concatenate([f.ravel() for f in outlines.fields])
     spread_of_cameras = np.linalg.norm(outlines.centres - outlines.centres.mean(0), axis=1)
-    far = 8.0 * max(float(spread_of_cameras.max()), 1e-9)
-    near = _NEAR * max(float(np.median(spread_of_cameras)), 1e-9)
+    far = 8.0 * (float(spread_of_cameras.max()) or 1e-9)
+    near = _NEAR * (float(np.median(spread_of_cameras)) or 1e-9)
     centre, radius = (
         (np.zeros(3), -1.0) if ball is None else (np.asarray(ball[0], np.float64), float(ball[1]))
     )

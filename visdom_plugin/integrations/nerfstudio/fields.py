@@ -87,7 +87,7 @@ def known_views(metadata: dict[str, Any] | None, method: str) -> TrainingViews:
     return metadata[METADATA]
 
 
-def silhouette_loss(accumulation: Tensor, image: Tensor) -> Tensor:
+def rgba_mask_loss(accumulation: Tensor, image: Tensor) -> Tensor:
     """Binary cross entropy between opacity (n, 1) and the alpha channel of the photographs' pixels (n, 4).
 
     Raises:
@@ -134,7 +134,7 @@ class _HullField(Model):
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if self.training and self.config.mask_weight > 0:
             with told():
-                loss = silhouette_loss(outputs["accumulation"], batch["image"].to(self.device))
+                loss = rgba_mask_loss(outputs["accumulation"], batch["image"].to(self.device))
             losses["mask_loss"] = self.config.mask_weight * loss
         return losses
 

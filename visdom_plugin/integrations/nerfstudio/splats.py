@@ -20,7 +20,7 @@ from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import TRAINING_DOMAIN, VisibleDomain
 from visdom_plugin.integrations.nerfstudio.dataparser import host_cameras, told
-from visdom_plugin.integrations.nerfstudio.fields import known_views, silhouette_loss
+from visdom_plugin.integrations.nerfstudio.fields import known_views, rgba_mask_loss
 
 REGULARIZER = RegularizerConfig(enabled=True)
 
@@ -68,7 +68,7 @@ class SplatfactoVd(SplatfactoModel):
             return losses
         if self.config.mask_weight > 0:
             with told():
-                loss = silhouette_loss(outputs["accumulation"], self.get_gt_img(batch["image"]))
+                loss = rgba_mask_loss(outputs["accumulation"], self.get_gt_img(batch["image"]))
             losses["mask_loss"] = self.config.mask_weight * loss
         if self.hook is not None:
             # A generator of the step's own, so that resumed runs draw the same views.

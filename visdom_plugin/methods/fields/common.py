@@ -6,20 +6,19 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from visdom_plugin.geometry.cameras import Cameras, pixel_radius, rays_of
+from visdom_plugin.geometry.cameras import Cameras, rays_of
 from visdom_plugin.geometry.mesh_files import mesh_ply
 from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook
 from visdom_plugin.losses import composite_target, mask_loss
 from visdom_plugin.nerf.frame import Frame
-from visdom_plugin.nerf.optimiser import FieldOptimiser
 from visdom_plugin.render import Render
-from visdom_plugin.training.protocols import PixelBatch, StepOutput
+from visdom_plugin.training.protocols import PixelBatch
 
 log = logging.getLogger(__name__)
 
@@ -57,21 +56,16 @@ def bound_rays(
         pixels: (n,) numbers of training pixels, see `PixelBatch`; None for other rays.
     """
     hit = torch.ones_like(near, dtype=torch.bool)
-    for hook in hooks:
-        limits = near / frame.scale, far / frame.scale
-        if pixels is not None and isinstance(hook, PixelSampler):
-            bounds = hook.bound_pixels(pixels, origins, directions, *limits)
-        else:
-            bounds = hook.bound(origins, directions, *limits)
-        near, far, hit = bounds.near * frame.scale, bounds.far * frame.scale, hit & bounds.hit
+    if hooks:
+        near, far = near / frame.scale, far / frame.scale
+        for hook in hooks:
+            if pixels is not None and isinstance(hook, PixelSampler):
+                near, far, met = hook.bound_pixels(pixels, origins, directions, near, far)
+            else:
+                near, far, met = hook.bound(origins, directions, near, far)
+            hit = hit & met
+        near, far = near * frame.scale, far * frame.scale
     return LocalRays(frame.to_local(origins), directions.float(), near.float(), far.float(), hit)
-
-
-def follow_pixels(hooks: Sequence[SamplerHook], cameras: Cameras) -> None:
-    """Tells hooks that can make use of it which cameras (N,), on the rays' device, the training pixels are of."""
-    for hook in hooks:
-        if isinstance(hook, PixelSampler):
-            hook.follow_pixels(cameras)
 
 
 def spread_rays(camera: Cameras, most: int = 256) -> tuple[Tensor, Tensor]:
@@ -84,28 +78,6 @@ def spread_rays(camera: Cameras, most: int = 256) -> tuple[Tensor, Tensor]:
     )
     grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2)
     return rays_of(camera.to(dtype=torch.float64), grid)
-
-
-class _Trainable(Protocol):
-    optimiser: FieldOptimiser
-
-    def train_step(self, batch: PixelBatch, step: int) -> StepOutput: ...
-
-
-def warm_up(method: _Trainable, camera: Cameras) -> None:
-    """Compiles the CPU kernels of a step, or loads them, on 16 pixels; the gradients are dropped."""
-    log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
-    origins, directions = (x.float() for x in spread_rays(camera, 4))
-    n = len(origins)
-    batch = PixelBatch(
-        origins=origins,
-        directions=directions,
-        rgb=torch.rand(n, 3, generator=torch.Generator().manual_seed(0)),
-        mask=torch.ones(n),
-        radii=pixel_radius(camera).expand(n),
-    )
-    method.train_step(batch, 1).total.backward()
-    method.optimiser.adam.zero_grad(set_to_none=True)
 
 
 def photograph_on(background: Tensor, batch: PixelBatch, alpha: Tensor) -> Tensor:

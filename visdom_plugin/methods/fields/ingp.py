@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.protocols import SamplerHook, sample_filters
@@ -15,19 +15,16 @@ from visdom_plugin.methods.fields.common import (
     LocalRays,
     bound_rays,
     export_mesh,
-    follow_pixels,
     mesh_density,
     photograph_on,
     psnr_of,
-    render_image,
     silhouette_loss,
     spread_rays,
-    warm_up,
 )
 from visdom_plugin.methods.fields.configs import IngpConfig
+from visdom_plugin.methods.fields.radiance_field import RadianceField
 from visdom_plugin.nerf.encoding.hash_grid import encode, initial_table
 from visdom_plugin.nerf.encoding.view_directions import encode_harmonics
-from visdom_plugin.nerf.frame import frame_of
 from visdom_plugin.nerf.mlp import perceptron, truncated_exp
 from visdom_plugin.nerf.optimiser import FieldOptimiser, warm_up_and_steps
 from visdom_plugin.nerf.rendering.volume_packed import composite_packed
@@ -38,22 +35,42 @@ from visdom_plugin.nerf.sampling.occupancy_grid import (
     march,
     select,
 )
-from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
 HUBER_DELTA = 0.1  # Instant-NGP
-RAYS_AT_ONCE = 1 << 14
 LEAST_RAYS = 64
 
 
-class Ingp:
+class Ingp(RadianceField[IngpConfig]):
     """See `visdom_plugin.training.protocols.Method` for what each call does."""
 
-    def __init__(self, config: IngpConfig):
-        self.config = config
-        self.total_steps = config.steps
+    rays_at_once = 1 << 14
+
+    def build(self, cameras: Cameras, generator: Generator) -> None:
+        c = self.config
+        self.table = torch.nn.Parameter(initial_table(c.grid, generator).to(self.device))
+        self.density_net = perceptron([c.grid.width, c.hidden, 1 + c.geometry_features], generator).to(
+            self.device
+        )
+        self.colour_net = perceptron(
+            [c.view_degree**2 + c.geometry_features, c.hidden, c.hidden, 3], generator
+        ).to(self.device)
+        nets = {f"density_net.{k}": p for k, p in self.density_net.named_parameters()}
+        nets |= {f"colour_net.{k}": p for k, p in self.colour_net.named_parameters()}
+        self.optimiser = FieldOptimiser(
+            [({"table": self.table}, 0.0), (nets, c.weight_decay)], betas=(0.9, 0.99), eps=1e-15
+        )
+        self.occupancy = OccupancyGrid(
+            c.occupancy_resolution, c.half_side, c.occupancy_alpha / c.step_length, device=self.device
+        )
+        if c.drop_unsampled:
+            # VaxNeRF's novel views do look at what training leaves out, so the grid must not hide it.
+            hooks = [] if c.vd.drop_outside else self.hooks
+            parts = [self._bound(*spread_rays(cameras[i]), hooks) for i in range(len(cameras))]
+            rays = LocalRays(*(torch.cat(x) for x in zip(*parts, strict=True)))
+            self.occupancy.restrict(rays.origins, rays.directions, rays.near, rays.far)
 
     def setup(
         self,
@@ -64,32 +81,7 @@ class Ingp:
         device: torch.device,
         seed: int,
     ) -> None:
-        c = self.config
-        self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
-        self.frame = frame_of(views.cameras)
-        follow_pixels(self.hooks, views.cameras.to(device))
-        draw = generator(seed, "field")
-        self.table = torch.nn.Parameter(initial_table(c.grid, draw).to(device))
-        self.density_net = perceptron([c.grid.width, c.hidden, 1 + c.geometry_features], draw).to(device)
-        self.colour_net = perceptron(
-            [c.view_degree**2 + c.geometry_features, c.hidden, c.hidden, 3], draw
-        ).to(device)
-        nets = {f"density_net.{k}": p for k, p in self.density_net.named_parameters()}
-        nets |= {f"colour_net.{k}": p for k, p in self.colour_net.named_parameters()}
-        self.optimiser = FieldOptimiser(
-            [({"table": self.table}, 0.0), (nets, c.weight_decay)], betas=(0.9, 0.99), eps=1e-15
-        )
-        self.occupancy = OccupancyGrid(
-            c.occupancy_resolution, c.half_side, c.occupancy_alpha / c.step_length, device=device
-        )
-        if c.drop_unsampled:
-            # VaxNeRF's novel views do look at what training leaves out, so the grid must not hide it.
-            hooks = [] if c.vd.drop_outside else self.hooks
-            parts = [self._bound(*spread_rays(views.cameras[i].to(device)), hooks) for i in range(len(views))]
-            rays = LocalRays(*(torch.cat(x) for x in zip(*parts, strict=True)))
-            self.occupancy.restrict(rays.origins, rays.directions, rays.near, rays.far)
-        if device.type == "cpu":
-            warm_up(self, views.cameras[0])
+        super().setup(views, hooks, hull=hull, device=device, seed=seed)
         self._rays = LEAST_RAYS
 
     def pixels_per_step(self, step: int) -> int:
@@ -103,12 +95,11 @@ class Ingp:
             fraction = 1.0 if step < c.occupancy_warm_up else c.occupancy_fraction
             self.occupancy.update(self._density, generator(self.seed, "occupancy", step), fraction=fraction)
         n = len(batch.mask)
-        background = torch.rand(n, 3, generator=draw) if c.background == "random" else torch.ones(n, 3)
-        background = background.to(self.device)
+        background = self.draw_background(n, draw)
         rays = self._bound(batch.origins, batch.directions, self.hooks, batch.pixels)
         step_length = torch.where(rays.hit, c.step_length, c.missing_step_length)
         shift = torch.rand(n, generator=draw).to(self.device)
-        samples = self._march(rays, rays.far, step_length, shift, self.hooks)
+        samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks)
         rgb, alpha, _ = self._shade(rays, samples, background)
         target = photograph_on(background, batch, alpha)
         self._adapt(n, len(samples.ray))
@@ -124,27 +115,22 @@ class Ingp:
         )
         self.optimiser.step(lr)
 
-    @torch.no_grad()
-    def render(self, camera: Cameras, background: Tensor) -> Render:
-        hooks = self._hooks_at_inference()
-        background = background.to(self.device)
-
-        def render_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            rays = self._bound(origins, directions, hooks)
-            far = torch.where(rays.hit, rays.far, rays.near)
-            step_length = torch.full_like(far, self.config.step_length)
-            shift = torch.zeros_like(far)
-            samples = self._march(rays, far, step_length, shift, hooks)
-            return self._shade(rays, samples, background.expand(len(far), 3))
-
-        return render_image(camera.to(self.device), render_rays, self.frame, RAYS_AT_ONCE)
+    def render_rays(
+        self, origins: Tensor, directions: Tensor, radius: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        hooks = self.hooks_at_inference()
+        rays = self._bound(origins, directions, hooks)
+        far = torch.where(rays.hit, rays.far, rays.near)
+        step_length = torch.full_like(far, self.config.step_length)
+        samples = self._take_samples(rays, far, step_length, torch.zeros_like(far), hooks)
+        return self._shade(rays, samples, background.expand(len(far), 3))
 
     def state_dict(self) -> dict[str, Tensor]:
         occupancy = {f"occupancy.{k}": v for k, v in self.occupancy.state_dict().items()}
-        return self.optimiser.state_dict() | occupancy | {"rays": torch.tensor(self._rays)}
+        return super().state_dict() | occupancy | {"rays": torch.tensor(self._rays)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.optimiser.load_state_dict(state)
+        super().load_state_dict(state)
         prefix = "occupancy."
         self.occupancy.load_state_dict(
             {k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)}
@@ -156,15 +142,12 @@ class Ingp:
             # What rendering skips is not there.
             points = points.to(self.device)
             there = self.occupancy.is_occupied(points)
-            for hook in sample_filters(self._hooks_at_inference()):
+            for hook in sample_filters(self.hooks_at_inference()):
                 there &= hook.keep(self.frame.to_world(points))
             return torch.where(there, self._density(points), 0)
 
         mesh = mesh_density(density_of, self._colour, self.frame, self.config.half_side)
         return export_mesh(Path(folder) / "mesh.ply", mesh, self.origin)
-
-    def _hooks_at_inference(self) -> list[SamplerHook]:
-        return self.hooks if self.config.vd.hull_at_inference else []
 
     def _bound(
         self,
@@ -177,7 +160,7 @@ class Ingp:
         near = enter.clamp_min(self.config.near)
         return bound_rays(origins, directions, near, torch.maximum(leave, near), self.frame, hooks, pixels)
 
-    def _march(
+    def _take_samples(
         self, rays: LocalRays, far: Tensor, step_length: Tensor, shift: Tensor, hooks: Sequence[SamplerHook]
     ) -> PackedSamples:
         samples = march(rays.origins, rays.directions, rays.near, far, step_length, shift, self.occupancy)

@@ -10,22 +10,19 @@ from typing import NamedTuple
 import torch
 from torch import Generator, Tensor, nn
 
-from visdom_plugin.geometry.cameras import Cameras, pixel_radius
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.protocols import SamplerHook
-from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.fields.common import (
     LocalRays,
     bound_rays,
     export_mesh,
-    follow_pixels,
     mesh_density,
     photograph_on,
     psnr_of,
-    render_image,
     silhouette_loss,
-    warm_up,
 )
 from visdom_plugin.methods.fields.configs import ZipNerfConfig
+from visdom_plugin.methods.fields.radiance_field import RadianceField
 from visdom_plugin.nerf.encoding.hash_grid import (
     HashLayout,
     encode_mean,
@@ -33,7 +30,6 @@ from visdom_plugin.nerf.encoding.hash_grid import (
     mean_square_per_level,
 )
 from visdom_plugin.nerf.encoding.view_directions import encode_sinusoids
-from visdom_plugin.nerf.frame import frame_of
 from visdom_plugin.nerf.mlp import perceptron, truncated_exp
 from visdom_plugin.nerf.optimiser import FieldOptimiser, warm_up_and_decay
 from visdom_plugin.nerf.rendering.proposal_losses import antialiased_interlevel_loss, distortion_loss
@@ -42,12 +38,9 @@ from visdom_plugin.nerf.sampling.contraction import contract
 from visdom_plugin.nerf.sampling.multisampling import multisample
 from visdom_plugin.nerf.sampling.ray_warp import curve_distances, distances_of
 from visdom_plugin.nerf.sampling.step_functions import anneal, sample_edges
-from visdom_plugin.render import Render
-from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
-RAYS_AT_ONCE = 1 << 12
 CHARBONNIER = 0.001  # Zip-NeRF
 RGB_PADDING = 0.001  # mip-NeRF
 INITIAL_FEATURE = 1e-4
@@ -59,12 +52,12 @@ INVISIBLE = 1 / 255
 class AntialiasedGrid(nn.Module):
     """A hash grid over contracted space, and one hidden layer behind it. The first output is the density's."""
 
-    def __init__(self, layout: HashLayout, hidden: int, outputs: int, draw: torch.Generator):
+    def __init__(self, layout: HashLayout, hidden: int, outputs: int, generator: Generator):
         super().__init__()
         self.layout = layout
-        self.table = nn.Parameter(initial_table(layout, draw, INITIAL_FEATURE))
+        self.table = nn.Parameter(initial_table(layout, generator, INITIAL_FEATURE))
         # Features, and for each level how much of it the sample is too large for.
-        self.net = perceptron([layout.width + layout.levels, hidden, outputs], draw)
+        self.net = perceptron([layout.width + layout.levels, hidden, outputs], generator)
 
     def forward(self, points: Tensor, std: Tensor) -> Tensor:
         """(..., S, 3) points in the local frame and (..., S) standard deviations to (..., outputs)."""
@@ -81,16 +74,16 @@ class AntialiasedGrid(nn.Module):
 class ColourNet(nn.Module):
     """Hidden layers whose input joins again before the last of them."""
 
-    def __init__(self, inputs: int, hidden: int, layers: int, draw: torch.Generator):
+    def __init__(self, inputs: int, hidden: int, layers: int, generator: Generator):
         super().__init__()
         self.layers = nn.ModuleList()
         width = inputs
         for i in range(layers):
             if i and i + 1 == layers:
                 width += inputs
-            self.layers.append(perceptron([width, hidden, hidden], draw, bias=True)[0])
+            self.layers.append(perceptron([width, hidden, hidden], generator, bias=True)[0])
             width = hidden
-        self.last = perceptron([width, 3], draw, bias=True)
+        self.last = perceptron([width, 3], generator, bias=True)
 
     def forward(self, x: Tensor) -> Tensor:
         h = x
@@ -112,41 +105,25 @@ class Level(NamedTuple):
     """(n, S)."""
 
 
-class ZipNerfLite:
+class ZipNerfLite(RadianceField[ZipNerfConfig]):
     """See `visdom_plugin.training.protocols.Method` for what each call does."""
 
-    def __init__(self, config: ZipNerfConfig):
-        self.config = config
-        self.total_steps = config.steps
+    rays_at_once = 1 << 12
 
-    def setup(
-        self,
-        views: Views,
-        hooks: Sequence[SamplerHook],
-        *,
-        hull: Hull | None,
-        device: torch.device,
-        seed: int,
-    ) -> None:
+    def build(self, cameras: Cameras, generator: Generator) -> None:
         c = self.config
-        self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
-        self.frame = frame_of(views.cameras)
-        follow_pixels(self.hooks, views.cameras.to(device))
-        draw = generator(seed, "field")
         self.model = nn.ModuleDict(
             {
-                "coarse": AntialiasedGrid(c.coarse_grid, c.hidden, 1, draw),
-                "fine": AntialiasedGrid(c.fine_grid, c.hidden, 1, draw),
-                "field": AntialiasedGrid(c.grid, c.hidden, 1 + c.bottleneck, draw),
+                "coarse": AntialiasedGrid(c.coarse_grid, c.hidden, 1, generator),
+                "fine": AntialiasedGrid(c.fine_grid, c.hidden, 1, generator),
+                "field": AntialiasedGrid(c.grid, c.hidden, 1 + c.bottleneck, generator),
                 "colour": ColourNet(
-                    c.bottleneck + 3 + 6 * c.view_degree, c.colour_hidden, c.colour_layers, draw
+                    c.bottleneck + 3 + 6 * c.view_degree, c.colour_hidden, c.colour_layers, generator
                 ),
             }
-        ).to(device)
+        ).to(self.device)
         named = dict(self.model.named_parameters())
         self.optimiser = FieldOptimiser([(named, 0.0)], betas=(0.9, 0.99), eps=1e-15)
-        if device.type == "cpu":
-            warm_up(self, views.cameras[0])
 
     def pixels_per_step(self, step: int) -> int:
         return self.config.rays
@@ -154,9 +131,7 @@ class ZipNerfLite:
     def train_step(self, batch: PixelBatch, step: int) -> StepOutput:
         c = self.config
         draw = generator(self.seed, "step", step)
-        n = len(batch.mask)
-        background = torch.rand(n, 3, generator=draw) if c.background == "random" else torch.ones(n, 3)
-        background = background.to(self.device)
+        background = self.draw_background(len(batch.mask), draw)
         rays = self._bound(batch.origins, batch.directions, self.hooks, batch.pixels)
         progress = step / max(c.steps, 1)
         levels, colours = self._see(rays, batch.radii, c.samples, progress, draw)
@@ -192,25 +167,6 @@ class ZipNerfLite:
             )
         )
 
-    @torch.no_grad()
-    def render(self, camera: Cameras, background: Tensor) -> Render:
-        c = self.config
-        hooks = self.hooks if c.vd.hull_at_inference else []
-        background = background.to(self.device)
-        radius = pixel_radius(camera)
-
-        def render_rays(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            rays = self._bound(origins, directions, hooks)
-            return self._render_rays(rays, radius, background)
-
-        return render_image(camera.to(self.device), render_rays, self.frame, RAYS_AT_ONCE)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return self.optimiser.state_dict()
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.optimiser.load_state_dict(state)
-
     def export(self, folder: Path) -> list[Path]:
         mesh = mesh_density(self._density, self._colour, self.frame, half_side=1.0)
         return export_mesh(Path(folder) / "mesh.ply", mesh, self.origin)
@@ -227,13 +183,13 @@ class ZipNerfLite:
         return bound_rays(origins, directions, near, far, self.frame, hooks, pixels)
 
     def _see(
-        self, rays: LocalRays, radius: Tensor, counts: Sequence[int], progress: float, draw: Generator
+        self, rays: LocalRays, radius: Tensor, counts: Sequence[int], progress: float, generator: Generator
     ) -> tuple[list[Level], Tensor]:
         """All levels along rays, and the field's colours (n, S, 3). Samples are jittered by the generator."""
         level = None
         levels = []
         for name, count in zip(LEVELS, counts, strict=True):
-            level, out = self._look(name, rays, radius, level, count, progress, draw)
+            level, out = self._look(name, rays, radius, level, count, progress, generator)
             levels.append(level)
         return levels, self._shade(out[..., 1:], rays.directions[:, None])
 
@@ -245,7 +201,7 @@ class ZipNerfLite:
         before: Level | None,
         count: int,
         progress: float,
-        draw: Generator | None,
+        generator: Generator | None,
     ) -> tuple[Level, Tensor]:
         """One level, sampled where the level before saw something, and its network's outputs (n, S, ...)."""
         n = len(rays.near)
@@ -254,19 +210,20 @@ class ZipNerfLite:
             s, weights = near.new_tensor([0.0, 1.0]).expand(n, 2).contiguous(), torch.ones_like(near)
         else:
             s, weights = before.s, before.weights.detach()
-        jitter = None if draw is None else torch.rand(n, 1, generator=draw).to(self.device)
+        jitter = None if generator is None else torch.rand(n, 1, generator=generator).to(self.device)
         s = sample_edges(s, anneal(weights, progress, self.config.anneal_slope), count, jitter)
         t = distances_of(s, near, far)
-        turn = None if draw is None else torch.rand(n, count, generator=draw).to(self.device)
+        turn = None if generator is None else torch.rand(n, count, generator=generator).to(self.device)
         points, std = multisample(rays.origins, rays.directions, t, radius, turn)
         out = self.model[name](points, std)
         density = truncated_exp(out[..., 0] + self.config.density_bias)
         return Level(s, t, weights_from_density(density, t)[0]), out
 
-    def _render_rays(
-        self, rays: LocalRays, radius: Tensor, background: Tensor
+    def render_rays(
+        self, origins: Tensor, directions: Tensor, radius: Tensor, background: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Colour, opacity and depth of rays, level by level for those that still may show something."""
+        # Level by level, for those rays that still may show something.
+        rays = self._bound(origins, directions, self.hooks_at_inference())
         counts = self.config.test_samples or self.config.samples
         n = len(rays.near)
         rgb, alpha, depth = background.expand(n, 3).clone(), torch.zeros_like(rays.near), rays.far.clone()

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import logging
-
 import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.losses import composite_target, mask_loss, photometric_loss
 from visdom_plugin.render import Render
-from visdom_plugin.splat.cpu.backend import warm_up
 from visdom_plugin.splat.set_config import GaussianSetConfig
 from visdom_plugin.training.protocols import ViewBatch
-
-log = logging.getLogger(__name__)
 
 
 def fit_view(
@@ -41,13 +36,6 @@ def draw_background(config: GaussianSetConfig, generator: Generator, device: tor
     """(3,) the training background of a step."""
     background = torch.rand(3, generator=generator) if config.background == "random" else torch.ones(3)
     return background.to(device)
-
-
-def load_kernels(device: torch.device) -> None:
-    """Compiles the CPU rasteriser ahead of the first step, and says so."""
-    if device.type == "cpu":
-        log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
-        warm_up()
 
 
 def scene_extent(cameras: Cameras) -> float:

@@ -46,7 +46,10 @@ class GsGoConfig(HullStartConfig):
 
     prune_large_from: int = 1_000
     """From here on Gaussians too large on screen or in space are removed."""
-    prune_radius_px: float = 20.0
+    prune_radius: float = 0.025
+    """Fraction of the picture's longer side: 3DGS's 20 pixels at 800."""
+    prune_radius_px: float | None = None
+    """The same in pixels; wins over the fraction."""
     prune_scale: float = 0.1
     """Fraction of the extent."""
     opacity_reset_every: int = 1_000
@@ -60,12 +63,16 @@ class GsGoConfig(HullStartConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         not_negative = ("depth_weight", "prune_large_from", "opacity_reset_every", "floater_every")
-        positive = ("prune_radius_px", "prune_scale")
+        positive = ("prune_radius", "prune_scale")
+        radius_px = self.prune_radius_px
         demand(
             self,
             {name: (getattr(self, name) >= 0, "0 or more") for name in not_negative}
             | {name: (getattr(self, name) > 0, "a positive number") for name in positive}
-            | {"floater_sigmas": (min(self.floater_sigmas) >= 0, "numbers of 0 or more")},
+            | {
+                "prune_radius_px": (radius_px is None or radius_px > 0, "a positive number, or None"),
+                "floater_sigmas": (min(self.floater_sigmas) >= 0, "numbers of 0 or more"),
+            },
         )
 
 

@@ -10,40 +10,33 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
+from visdom_plugin import seeding
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.losses import photometric_loss
-from visdom_plugin.methods.splats.common import draw_background, fit_view, load_kernels, scene_extent
+from visdom_plugin.methods.splats.common import draw_background, fit_view
 from visdom_plugin.methods.splats.configs import CorgsConfig
 from visdom_plugin.methods.splats.initial_points import draw_box, draw_points
 from visdom_plugin.methods.splats.pseudo_views import draw_between, draw_on_ellipse, fit_ellipse
+from visdom_plugin.methods.splats.splat_method import SplatMethod
 from visdom_plugin.methods.splats.strategy import Schedule, Strategy, every
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
-from visdom_plugin.seeding import generator
 from visdom_plugin.splat.gaussians import Gaussians
-from visdom_plugin.splat.model import GaussianSet
-from visdom_plugin.splat.ply import write_gaussians
-from visdom_plugin.splat.rasterise import rasterise
 from visdom_plugin.training.protocols import StepOutput, ViewBatch
 
 log = logging.getLogger(__name__)
 
 
-class CorgsLite:
+class CorgsLite(SplatMethod[CorgsConfig]):
     """See `visdom_plugin.training.protocols.Method` for what each call does. Set 0 is shown and exported."""
-
-    def __init__(self, config: CorgsConfig):
-        self.config = config
-        self.total_steps = config.steps
 
     def setup(
         self,
@@ -54,37 +47,39 @@ class CorgsLite:
         device: torch.device,
         seed: int,
     ) -> None:
-        c = self.config
         if len(views) < 2:
             raise SceneError(
                 f"corgs-lite compares its two sets between training cameras, and there is {len(views)}",
                 todo="give --views 2 or more",
             )
-        self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
+        super().setup(views, hooks, hull=hull, device=device, seed=seed)
+
+    def build(self, views: Views, hull: Hull | None, generator: Generator) -> None:
+        c = self.config
         self.cameras, self.look_at = views.cameras, look_at_point(views.cameras)
         self.ellipse = fit_ellipse(views.cameras)
-        load_kernels(device)
-        draw = generator(seed, "initial_points")
         if c.initial_cloud == "random" and not self.hooks:
-            xyz, rgb = draw_box(views.cameras, c.initial_points, draw)
+            xyz, rgb = draw_box(views.cameras, c.initial_points, generator)
         else:
-            xyz, rgb = draw_points(self.hooks, hull, views, c.initial_points, draw)
-        extent = scene_extent(views.cameras)
-        self.sets = [GaussianSet(c, xyz, rgb, extent=extent, device=device) for _ in range(2)]
+            xyz, rgb = draw_points(self.hooks, hull, views, c.initial_points, generator)
+        self.sets = [self.make_set(xyz, rgb, views.cameras) for _ in range(2)]
+        self.splats = self.sets[0]
         schedule = Schedule(every(c.opacity_reset_every, c.opacity_reset_from, c.steps + 1))
         self.strategies = [
-            Strategy(one, schedule, partial(generator, seed, "split", i)) for i, one in enumerate(self.sets)
+            Strategy(one, schedule, partial(seeding.generator, self.seed, "split", i))
+            for i, one in enumerate(self.sets)
         ]
-        self.co_prune_distance = c.co_prune_extents * extent if c.co_prune_world is None else c.co_prune_world
+        extents, world = c.co_prune_extents * self.splats.extent, c.co_prune_world
+        self.co_prune_distance = extents if world is None else world / self.unit
 
     def train_step(self, batch: ViewBatch, step: int) -> StepOutput:
         c, done = self.config, step + 1
         degree = self.strategies[0].sh_degree(step)
-        background = draw_background(c, generator(self.seed, "step", step), self.device)
+        background = draw_background(c, seeding.generator(self.seed, "step", step), self.device)
         sets = [one.gaussians() for one in self.sets]
 
         def show(gaussians: Gaussians, camera: Cameras) -> Render:
-            return rasterise(gaussians, camera, background, sh_degree=degree)
+            return self.splats.draw(camera, background, gaussians, degree)
 
         renders = [show(gaussians, batch.camera) for gaussians in sets]
         (losses, psnr), (others, _) = (fit_view(render, batch, background, c) for render in renders)
@@ -96,13 +91,13 @@ class CorgsLite:
         for h, hook in enumerate(self.hooks):
             for i, gaussians in enumerate(sets):
                 # The same numbers for both sets, so that the hook shows both the same views.
-                draw = generator(self.seed, "hook", h, step)
+                draw = seeding.generator(self.seed, "hook", h, step)
                 losses |= _numbered(hook.loss(partial(show, gaussians), step, draw), i)
         return StepOutput(losses, {"psnr": psnr}, renders)
 
     def pseudo_camera(self, step: int) -> Cameras:
         """The unseen view of a step, the same for both sets."""
-        draw = generator(self.seed, "pseudo", step)
+        draw = seeding.generator(self.seed, "pseudo", step)
         if self.config.pseudo_views == "ellipse":
             return draw_on_ellipse(self.ellipse, draw)
         return draw_between(self.cameras, self.look_at, draw)
@@ -118,19 +113,16 @@ class CorgsLite:
             strategy.after_step(self.hooks, step)
 
     def _co_prune(self, done: int) -> None:
-        gone = unmatched(self.sets[0].means, self.sets[1].means, self.co_prune_distance)
+        first, second = (one.gaussians().means for one in self.sets)
+        gone = unmatched(first, second, self.co_prune_distance)
         if bool(gone[0].all()):
             log.warning(
                 "step %d: the two sets are nowhere closer than %.3g, none is pruned",
                 done,
-                self.co_prune_distance,
+                self.co_prune_distance * self.unit,
             )
         for strategy, lonely in zip(self.strategies, gone, strict=True):
-            strategy.remove(lonely)
-
-    @torch.no_grad()
-    def render(self, camera: Cameras, background: Tensor) -> Render:
-        return rasterise(self.sets[0].gaussians(), camera, background.to(self.device))
+            strategy.remove(lonely, "without a neighbour in the other set")
 
     def state_dict(self) -> dict[str, Tensor]:
         states = (strategy.state_dict() for strategy in self.strategies)
@@ -140,11 +132,6 @@ class CorgsLite:
         for i, strategy in enumerate(self.strategies):
             prefix = f"set{i}."
             strategy.load_state_dict({k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)})
-
-    def export(self, folder: Path) -> list[Path]:
-        path = Path(folder) / "point_cloud.ply"
-        write_gaussians(path, self.sets[0].gaussians(), self.origin)
-        return [path]
 
 
 def co_regularisation(first: Tensor, second: Tensor, ssim_weight: float, weight: float) -> dict[str, Tensor]:

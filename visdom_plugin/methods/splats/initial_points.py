@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.geometry.cameras import Cameras, look_at_point, project
+from visdom_plugin.geometry.cameras import Cameras, look_at_point, mean_distance, project
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import Views
@@ -46,7 +46,7 @@ def draw_box(cameras: Cameras, n: int, generator: Generator) -> tuple[Tensor, Te
         xyz (n, 3) float32 world frame and rgb (n, 3).
     """
     centre = look_at_point(cameras)
-    half_side = BOX_HALF_SIDE * (cameras.centres - centre).norm(dim=-1).mean()
+    half_side = BOX_HALF_SIDE * mean_distance(cameras, centre)
     unit = 2 * torch.rand(n, 3, generator=generator, dtype=torch.float64) - 1
     return (centre.double() + half_side.double() * unit).float(), torch.full((n, 3), 0.5)
 

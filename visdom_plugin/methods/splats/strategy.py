@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor
@@ -14,6 +16,8 @@ from visdom_plugin.render import Render
 from visdom_plugin.splat.densify import split_children, stray_gaussians
 from visdom_plugin.splat.model import GaussianSet
 
+log = logging.getLogger(__name__)
+
 FEWEST = 16
 """Of fewer Gaussians none is called stray."""
 
@@ -21,6 +25,17 @@ FEWEST = 16
 def every(n: int, first: int, until: int) -> range:
     """Steps `first`, `first + n`, ... before `until`; none where n is 0."""
     return range(first, until, n) if n else range(0)
+
+
+class LargestGaussian(NamedTuple):
+    """How large Gaussians may be."""
+
+    scale: float
+    """Of the standard deviations, in extents."""
+    radius: float
+    """Three standard deviations on screen, as a fraction of the picture's longer side."""
+    radius_px: float | None
+    """The same in pixels; wins over the fraction."""
 
 
 @dataclass(frozen=True)
@@ -35,15 +50,16 @@ class Schedule:
     """Its threshold in standard deviations, from the first of these steps to the last."""
     prune_large_from: int | None = None
     """After this step densification removes large Gaussians, too; None for never."""
-    largest: tuple[float, float] = (float("inf"), float("inf"))
-    """Largest radius in pixels and largest scale in extents that may stay then."""
+    largest: LargestGaussian | None = None
+    """How large one may be that stays then."""
 
 
 class Strategy:
     """Adaptive density control of one set of Gaussians (Kerbl et al. 2023, section 5).
 
     Its state is what it measured of each Gaussian since the last densification: the sum of the norms of the loss's
-    gradient by the projected mean, in how many steps the Gaussian was seen, and its largest radius in pixels.
+    gradient by the projected mean, in how many steps the Gaussian was seen, and its largest radius: a
+    fraction of the picture's longer side, or in pixels where the schedule's is.
 
     Args:
         splats: the set; from here on Gaussians are removed through the strategy alone.
@@ -56,7 +72,9 @@ class Strategy:
         c = splats.config
         first = c.densify_every * (c.densify_from // c.densify_every + 1)
         self.densify_steps = every(c.densify_every, first, c.densify_until)
-        self._gradient = self._count = self._radius_px = torch.zeros(len(splats), device=splats.device)
+        self._gradient = self._count = self._radius = torch.zeros(len(splats), device=splats.device)
+        self._removed: Counter[str] = Counter()
+        self._most, self._warned = len(splats), False
 
     def sh_degree(self, step: int) -> int:
         """Degree of the spherical harmonics in use: training starts at 0."""
@@ -68,7 +86,7 @@ class Strategy:
         Args:
             render: the training view, after the backward pass.
         """
-        self._measure(render.info)
+        self._measure(render)
         self.splats.optimise(step)
         done, schedule = step + 1, self.schedule
         if done in self.densify_steps:
@@ -76,41 +94,45 @@ class Strategy:
         if done in schedule.remove_strays and len(self.splats) >= FEWEST:
             steps, (first, last) = schedule.remove_strays, schedule.stray_sigmas
             t = (done - steps.start) / max(steps.stop - steps.start, 1)
-            self.remove(stray_gaussians(self.splats.means, first + t * (last - first)))
+            strays = stray_gaussians(self.splats.gaussians().means, first + t * (last - first))
+            self.remove(strays, "far from their neighbours")
         if done in schedule.reset_opacity:
             self.splats.reset_opacity()
+        self._warn_of_loss(done)
 
     def after_step(self, hooks: Sequence[GaussianHook], step: int) -> None:
         """Removes the Gaussians that hooks mark."""
         for hook in hooks:
-            self.remove(hook.after_step(self.splats.gaussians(), step))
+            self.remove(hook.after_step(self.splats.in_scene(), step), "outside the hull")
 
-    def remove(self, gone: Tensor | None) -> None:
+    def remove(self, gone: Tensor | None, why: str) -> None:
         """Removes Gaussians where `gone` (N,) bool is True; all of them, or None, and it removes none."""
         if gone is None or not bool(gone.any()) or bool(gone.all()):
             return
+        self._removed[why] += int(gone.sum())
         self.splats.optimiser.keep(~gone)
-        self._gradient, self._count, self._radius_px = (
-            x[~gone] for x in (self._gradient, self._count, self._radius_px)
+        self._gradient, self._count, self._radius = (
+            x[~gone] for x in (self._gradient, self._count, self._radius)
         )
 
     def state_dict(self) -> dict[str, Tensor]:
         """The set's parameters and moments, and the measurements, as a flat dict of tensors."""
-        return self.splats.optimiser.state_dict() | {
+        return self.splats.state_dict() | {
             "stats.gradient": self._gradient,
             "stats.count": self._count,
-            "stats.radius_px": self._radius_px,
+            "stats.radius_px": self._radius,
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Takes over what `state_dict` gave; the number of Gaussians may differ."""
-        self.splats.optimiser.load_state_dict(state)
-        self._gradient, self._count, self._radius_px = (
+        self.splats.load_state_dict(state)
+        self._gradient, self._count, self._radius = (
             state[f"stats.{name}"].to(self.splats.device).clone()
             for name in ("gradient", "count", "radius_px")
         )
 
-    def _measure(self, info: dict[str, Any]) -> None:
+    def _measure(self, render: Render) -> None:
+        info = render.info
         # In normalised device units. Numbers, not a tensor: a copy to the GPU would wait for it.
         u, v = info["means2d"].grad.unbind(-1)
         norm = torch.stack([u * (info["width"] / 2), v * (info["height"] / 2)], -1).norm(dim=-1)
@@ -118,7 +140,10 @@ class Strategy:
         self._gradient = self._gradient + torch.where(visible, norm, 0)
         self._count = self._count + visible
         radii = info["radii"] if info["radii"].ndim == 1 else info["radii"].amax(-1)
-        self._radius_px = torch.maximum(self._radius_px, torch.where(visible, radii, 0).float())
+        largest = self.schedule.largest
+        in_pixels = largest is not None and largest.radius_px is not None
+        unit = 1 if in_pixels else max(info["width"], info["height"])
+        self._radius = torch.maximum(self._radius, torch.where(visible, radii, 0).float() / unit)
 
     def _densify(self, done: int) -> None:
         """Clones, splits and prunes by what was measured since the last time."""
@@ -134,12 +159,29 @@ class Strategy:
         new = len(splats) - len(split)
         p = {name: value.detach() for name, value in splats.optimiser.parameters.items()}
         gone = torch.cat([split, split.new_zeros(new)]) | (p["opacity_logits"].sigmoid() < c.prune_opacity)
-        start = self.schedule.prune_large_from
-        if start is not None and done > start:
-            radius, scale = self.schedule.largest
-            on_screen = torch.cat([self._radius_px, self._radius_px.new_zeros(new)])
+        start, largest = self.schedule.prune_large_from, self.schedule.largest
+        faint = int(gone.sum()) - len(children["means"]) // 2
+        if start is not None and largest is not None and done > start:
+            on_screen = torch.cat([self._radius, self._radius.new_zeros(new)])
             in_space = p["log_scales"].exp().amax(-1)
-            gone |= (on_screen > radius) | (in_space > scale * splats.extent)
+            gone |= on_screen > (largest.radius if largest.radius_px is None else largest.radius_px)
+            gone |= in_space > largest.scale * splats.extent
         if not bool(gone.all()):
+            self._removed["fainter than prune_opacity"] += faint
+            self._removed["larger than prune_radius or prune_scale"] += (
+                int(gone.sum()) - faint - len(children["means"]) // 2
+            )
             splats.optimiser.keep(~gone)
-        self._gradient = self._count = self._radius_px = torch.zeros(len(splats), device=splats.device)
+        self._gradient = self._count = self._radius = torch.zeros(len(splats), device=splats.device)
+
+    def _warn_of_loss(self, done: int) -> None:
+        """Says once when most Gaussians are gone, and why."""
+        self._most = max(self._most, len(self.splats))
+        if not self._warned and 2 * len(self.splats) < self._most:
+            self._warned = True
+            why = ", ".join(f"{n} {reason}" for reason, n in self._removed.most_common() if n)
+            log.warning(
+                "step %d: %d of %d Gaussians are left; removed so far: %s. Fine detail needs more of them: "
+                "weaken what removes them, e.g. with --method.prune-radius",
+                *(done, len(self.splats), self._most, why),
+            )

@@ -5,15 +5,16 @@ from __future__ import annotations
 import logging
 import time
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from visdom_plugin.atomic_files import finite
 from visdom_plugin.errors import VisDomError
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import Scene
 from visdom_plugin.training.hull_run.config import METHOD, HullRunConfig
 from visdom_plugin.training.run import find_versions
 from visdom_plugin.training.runs.config_io import as_plain
-from visdom_plugin.training.runs.run_directory import RunDir, describe_data
+from visdom_plugin.training.runs.run_directory import Record, RunDir, describe_data
 from visdom_plugin.training.runs.saved_hulls import write_hull
 
 log = logging.getLogger(__name__)
@@ -22,7 +23,17 @@ DISTANCES = ("chamfer_sym", "chamfer_target_to_hull", "chamfer_hull_to_target", 
 VOLUMES = ("iou", "covered", "target_volume")
 
 
-def measure_hull(scene: Scene, config: HullRunConfig, *, seed: int = 0) -> dict[str, Any]:
+class Measured(TypedDict):
+    """A carved hull and its numbers."""
+
+    metrics: Record
+    """What run.json holds."""
+    hull: Hull
+    hull_s: float
+    """Seconds."""
+
+
+def measure_hull(scene: Scene, config: HullRunConfig, *, seed: int = 0) -> Measured:
     """Carves the training views' hull and measures it.
 
     Chamfer distances are means over points of squared distances, in square scene units (the paper prints 1000
@@ -33,8 +44,8 @@ def measure_hull(scene: Scene, config: HullRunConfig, *, seed: int = 0) -> dict[
         seed: of the points drawn.
 
     Returns:
-        {"metrics": what run.json holds, "hull": Hull, "hull_s": seconds}. Metrics that need the target are None
-        where the scene has no mesh, and `metrics["target"]["missing"]` is True.
+        Metrics that need the target are None where the scene has no mesh, and `metrics["target"]["missing"]` is
+        True.
 
     Raises:
         EmptyHullError: nothing is left.
@@ -44,9 +55,13 @@ def measure_hull(scene: Scene, config: HullRunConfig, *, seed: int = 0) -> dict[
     began = time.monotonic()
     hull = config.hull.carve(*scene.train.silhouettes())
     hull_s = time.monotonic() - began
-    test: dict[str, Any] = dict.fromkeys((*DISTANCES, *VOLUMES))
+    test: dict[str, float | None] = dict.fromkeys((*DISTANCES, *VOLUMES))
     test |= {"volume": hull.volume, "surface_area": hull.surface_area, "voxels": hull.voxels}
-    target: dict[str, Any] = {"missing": scene.mesh is None, "samples": config.samples, "units": scene.units}
+    target: dict[str, object] = {
+        "missing": scene.mesh is None,
+        "samples": config.samples,
+        "units": scene.units,
+    }
     if scene.mesh is not None:
         vertices, faces = (x.numpy() for x in scene.mesh)
         truth, again = (draw_on_surface(vertices, faces, config.samples, seed, i) for i in (0, 1))
@@ -74,9 +89,9 @@ def carve_run(
     run_dir: Path,
     seed: int = 0,
     overwrite: bool = False,
-    request: dict[str, Any] | None = None,
+    request: Record | None = None,
     budget: str | None = None,
-) -> dict[str, Any]:
+) -> Record:
     """`measure_hull` into a run directory; nothing is done where it is finished already.
 
     Returns:

@@ -7,12 +7,15 @@ import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from torch import Tensor
 
 from visdom_plugin.atomic_files import write_bytes, write_json
 from visdom_plugin.errors import CheckpointError
+
+Notes: TypeAlias = dict[str, Any]
+"""JSON beside a state."""
 
 KEPT = 2
 """The newest states are kept; the one before the last is there in case the last is damaged."""
@@ -28,11 +31,11 @@ class Checkpoint:
     """Steps done: training goes on with this one."""
     tensors: dict[str, Tensor]
     """The method's state, on the CPU."""
-    notes: dict[str, Any]
+    notes: Notes
     """What the trainer wants to remember besides, e.g. the seconds spent."""
 
 
-def save(folder: Path, step: int, tensors: dict[str, Tensor], notes: dict[str, Any]) -> Path:
+def save(folder: Path, step: int, tensors: dict[str, Tensor], notes: Notes) -> Path:
     """Writes the state after `step` steps and removes all but the newest `KEPT`.
 
     The JSON comes last: a state without it does not count. Returns the safetensors file.

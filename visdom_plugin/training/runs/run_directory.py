@@ -15,9 +15,10 @@ import os
 import shutil
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from visdom_plugin.atomic_files import MARK, remove_parts, write_bytes, write_json
 from visdom_plugin.errors import CheckpointError, list_some
@@ -26,6 +27,9 @@ from visdom_plugin.training.runs.checkpoints import list_steps
 from visdom_plugin.training.runs.config_io import as_plain, differences
 
 log = logging.getLogger(__name__)
+
+Record: TypeAlias = dict[str, Any]
+"""run.json, or an entry of it: plain data."""
 
 SCHEMA = 1
 IDENTITY = ("method", "scene", "seed", "config", "data")
@@ -45,7 +49,7 @@ def hash_views(views: Views) -> str:
     """
     digest = hashlib.sha256()
 
-    def add(*arrays: Any) -> None:
+    def add(*arrays: ArrayLike) -> None:
         for array in arrays:
             array = np.ascontiguousarray(array)
             digest.update(f"{array.dtype}{array.shape}".encode())
@@ -62,17 +66,18 @@ def hash_views(views: Views) -> str:
     for i, name in enumerate(views.names):
         digest.update(name.encode())
         add(views.images[i], views.masks[i])
-        if views.mono_depths and views.mono_depths[i] is not None:
-            add(views.mono_depths[i])
-        if views.ignored(i) is not None:
+        depth, ignored = views.mono_depths[i] if views.mono_depths else None, views.ignored(i)
+        if depth is not None:
+            add(depth)
+        if ignored is not None:
             digest.update(b"ignore")
-            add(views.ignored(i))
+            add(ignored)
         if views.mask_origin(i) != "given":
             digest.update(views.mask_origin(i).encode())
     return digest.hexdigest()
 
 
-def describe_data(scene: Scene, request: dict[str, Any]) -> dict[str, Any]:
+def describe_data(scene: Scene, request: Record) -> Record:
     """The `data` entry of run.json.
 
     Args:
@@ -103,12 +108,12 @@ class RunDir:
 
     def __init__(self, path: Path):
         self.path = Path(path)
-        self.record: dict[str, Any] = {}
+        self.record: Record = {}
         self._lock: TextIO | None = None
         self._is_new = False
 
     @classmethod
-    def open(cls, path: Path, identity: dict[str, Any], *, overwrite: bool = False) -> RunDir:
+    def open(cls, path: Path, identity: Record, *, overwrite: bool = False) -> RunDir:
         """Creates the directory, or opens it when it holds the same run.
 
         Args:
@@ -165,7 +170,7 @@ class RunDir:
         run._take_lock()
         return run
 
-    def update(self, **fields: Any) -> None:
+    def update(self, **fields: object) -> None:
         """Changes fields of run.json."""
         self.record |= as_plain(fields)
         write_json(self.path / "run.json", self.record)
@@ -192,7 +197,7 @@ class RunDir:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def log(self, row: dict[str, Any]) -> None:
+    def log(self, row: Record) -> None:
         """Appends one line to log.jsonl."""
         with (self.path / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
@@ -248,7 +253,7 @@ class RunDir:
             else:
                 target.unlink(missing_ok=True)
 
-    def _goes_on(self, identity: dict[str, Any]) -> bool:
+    def _goes_on(self, identity: Record) -> bool:
         """Whether the directory holds this very run, interrupted or killed."""
         try:
             record = read_record(self.path)
@@ -260,28 +265,38 @@ class RunDir:
         log.info("the run directory holds this run, cut short: it goes on (--overwrite is for other runs)")
         return True
 
-    def _refuse_other(self, identity: dict[str, Any]) -> None:
+    def _refuse_other(self, identity: Record) -> None:
         if differences(_decisive(self.record), _decisive(identity)):
             there, now = ({name: record.get(name) for name in IDENTITY} for record in (self.record, identity))
             lines = differences(there, now)
+            # What the data hash to follows from how they are read.
+            lines = [line for line in lines if not line.startswith("data.hashes.")] or lines
             more = f"\n    and {len(lines) - 8} more" if len(lines) > 8 else ""
             raise CheckpointError(
                 "the run directory holds another run (there -> now):\n    " + "\n    ".join(lines[:8]) + more,
                 where=self.path,
-                todo="choose another directory with --out, or replace what is there with --overwrite",
+                todo=f"--out {free_name(self.path)} keeps both, --overwrite replaces what is there",
             )
 
 
-def _decisive(record: dict[str, Any]) -> dict[str, Any]:
+def free_name(path: Path) -> Path:
+    """A name beside a run directory that nothing has yet: 0-2 for 0."""
+    number = 2
+    while (free := path.with_name(f"{path.name}-{number}")).exists():
+        number += 1
+    return free
+
+
+def _decisive(record: Record) -> Record:
     """What must agree in two records of one run."""
     data = record.get("data")
     if isinstance(data, dict):
         # An option that nobody gave may be new since the record was written.
-        data = {name: v for name, v in data.items() if name not in _WHEREABOUTS and v is not None}
+        data = {name: v for name, v in data.items() if name not in _WHEREABOUTS and v not in (None, False)}
     return {name: record.get(name) for name in IDENTITY if name != "scene"} | {"data": data}
 
 
-def read_record(path: Path) -> dict[str, Any]:
+def read_record(path: Path) -> Record:
     """run.json of a run directory.
 
     Raises:

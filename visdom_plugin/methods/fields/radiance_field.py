@@ -1,0 +1,112 @@
+"""Base of the radiance fields: where they live, what they are handed, and how a view is drawn ray by ray."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Generic, TypeVar
+
+import torch
+from torch import Generator, Tensor
+
+from visdom_plugin.geometry.cameras import Cameras, pixel_radius
+from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook
+from visdom_plugin.hull.hull import Hull
+from visdom_plugin.methods.fields.common import render_image, spread_rays
+from visdom_plugin.methods.fields.configs import IngpConfig, ZipNerfConfig
+from visdom_plugin.nerf.frame import frame_of
+from visdom_plugin.nerf.optimiser import FieldOptimiser
+from visdom_plugin.render import Render
+from visdom_plugin.scene import Views
+from visdom_plugin.seeding import generator
+from visdom_plugin.training.protocols import PixelBatch, StepOutput
+
+Config = TypeVar("Config", IngpConfig, ZipNerfConfig)
+
+log = logging.getLogger(__name__)
+
+
+class RadianceField(ABC, Generic[Config]):
+    """See `visdom_plugin.training.protocols.Method` for what each call does."""
+
+    rays_at_once: ClassVar[int]
+    """When rendering."""
+    optimiser: FieldOptimiser
+    """Of all that is trained; made by `build`."""
+
+    def __init__(self, config: Config):
+        self.config: Config = config
+        self.total_steps = config.steps
+
+    def setup(
+        self,
+        views: Views,
+        hooks: Sequence[SamplerHook],
+        *,
+        hull: Hull | None,
+        device: torch.device,
+        seed: int,
+    ) -> None:
+        self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
+        self.frame = frame_of(views.cameras)
+        cameras = views.cameras.to(device)
+        for hook in self.hooks:
+            if isinstance(hook, PixelSampler):
+                hook.follow_pixels(cameras)
+        self.build(cameras, generator(seed, "field"))
+        if device.type == "cpu":
+            self._warm_up(views.cameras[0])
+
+    @abstractmethod
+    def build(self, cameras: Cameras, generator: Generator) -> None:
+        """Makes parameters and optimiser, for the training cameras (N,) on the method's device."""
+
+    @abstractmethod
+    def train_step(self, batch: PixelBatch, step: int) -> StepOutput: ...
+
+    @abstractmethod
+    def render_rays(
+        self, origins: Tensor, directions: Tensor, radius: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What `render_image` asks for; `radius` of the pixels' cones at distance 1."""
+
+    @torch.no_grad()
+    def render(self, camera: Cameras, background: Tensor) -> Render:
+        background, radius = background.to(self.device), pixel_radius(camera)
+        return render_image(
+            camera.to(self.device),
+            lambda origins, directions: self.render_rays(origins, directions, radius, background),
+            self.frame,
+            self.rays_at_once,
+        )
+
+    def hooks_at_inference(self) -> list[SamplerHook]:
+        """The hooks that bound the rays of novel views."""
+        return self.hooks if self.config.vd.hull_at_inference else []
+
+    def draw_background(self, n: int, generator: Generator) -> Tensor:
+        """(n, 3) behind the photographs of a training step."""
+        random = self.config.background == "random"
+        return (torch.rand(n, 3, generator=generator) if random else torch.ones(n, 3)).to(self.device)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return self.optimiser.state_dict()
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.optimiser.load_state_dict(state)
+
+    def _warm_up(self, camera: Cameras) -> None:
+        """Compiles the CPU kernels of a step, or loads them, on 16 pixels; the gradients are dropped."""
+        log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
+        origins, directions = (x.float() for x in spread_rays(camera, 4))
+        n = len(origins)
+        batch = PixelBatch(
+            origins=origins,
+            directions=directions,
+            rgb=torch.rand(n, 3, generator=torch.Generator().manual_seed(0)),
+            mask=torch.ones(n),
+            radii=pixel_radius(camera).expand(n),
+        )
+        self.train_step(batch, 1).total.backward()
+        self.optimiser.adam.zero_grad(set_to_none=True)
