@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from visdom_plugin.methods.splats.configs import GsGoConfig
-from visdom_plugin.methods.splats.strategy import Schedule, Strategy, every
+from visdom_plugin.methods.splats.strategy import LargestGaussian, Schedule, Strategy, every
 from visdom_plugin.seeding import generator
 from visdom_plugin.splat.model import GaussianSet
 
@@ -80,14 +80,42 @@ def test_gaussians_that_pull_grow_and_what_was_measured_is_forgotten():
 
 def test_large_gaussians_go_only_after_the_step_that_says_so():
     for start, left in ((3, 15), (4, 30), (None, 30)):
-        schedule = Schedule(range(0), prune_large_from=start, largest=(5.0, 10.0))
-        strategy = strategy_of(schedule=schedule)
-        render = drawn(30)
-        render.info["radii"][:15] = 6
-        for p in strategy.splats.optimiser.parameters.values():
-            p.grad = torch.zeros_like(p)
-        strategy.after_backward(3, render)
-        assert len(strategy.splats) == left
+        assert left_of_large(LargestGaussian(10.0, 0.0, 5.0), start) == left
+
+
+def left_of_large(largest, start=3, radius=6, factor=1):
+    """How many of 30 stay of which 15 have that radius, in a picture of 4 x 2 times a factor."""
+    strategy = strategy_of(schedule=Schedule(range(0), prune_large_from=start, largest=largest))
+    render = drawn(30)
+    render.info["radii"][:15] = radius * factor
+    render.info |= {"width": 4 * factor, "height": 2 * factor}
+    for p in strategy.splats.optimiser.parameters.values():
+        p.grad = torch.zeros_like(p)
+    strategy.after_backward(3, render)
+    return len(strategy.splats)
+
+
+def test_how_large_is_too_large_follows_the_size_of_the_picture():
+    for factor in (1, 2, 10):
+        assert left_of_large(LargestGaussian(10.0, 1.49, None), factor=factor) == 15
+        assert left_of_large(LargestGaussian(10.0, 1.51, None), factor=factor) == 30
+    # In pixels it does not.
+    assert left_of_large(LargestGaussian(10.0, 1.0, 7.0)) == 30
+    assert left_of_large(LargestGaussian(10.0, 1.0, 7.0), factor=2) == 15
+
+
+def test_losing_more_than_half_is_said_once_with_the_reasons(caplog):
+    strategy = strategy_of()
+    strategy.remove(torch.arange(30) < 15, "outside the hull")
+    step(strategy, 0)
+    assert caplog.text == ""
+    strategy.remove(torch.arange(15) < 4, "far from their neighbours")
+    step(strategy, 1)
+    strategy.remove(torch.arange(11) < 5, "outside the hull")
+    step(strategy, 2)
+    (record,) = caplog.records
+    said = "step 2: 11 of 30 Gaussians are left; removed so far: 15 outside the hull, 4 far from their neighbours"
+    assert record.levelname == "WARNING" and said in record.getMessage()
 
 
 def test_measurements_follow_their_gaussians_and_are_state():
@@ -99,14 +127,14 @@ def test_measurements_follow_their_gaussians_and_are_state():
     strategy.after_backward(0, render)
     before = strategy.state_dict()["stats.gradient"]
     gone = torch.arange(30) % 3 == 0
-    strategy.remove(gone)
+    strategy.remove(gone, "why")
     assert torch.equal(strategy.state_dict()["stats.gradient"], before[~gone])
     twin = strategy_of(n=7)
     twin.load_state_dict({k: v.clone() for k, v in strategy.state_dict().items()})
     assert twin.state_dict().keys() == strategy.state_dict().keys()
     assert all(torch.equal(v, twin.state_dict()[k]) for k, v in strategy.state_dict().items())
     for none in (None, torch.zeros(20, dtype=torch.bool), torch.ones(20, dtype=torch.bool)):
-        strategy.remove(none)
+        strategy.remove(none, "why")
         assert len(strategy.splats) == 20
 
 
