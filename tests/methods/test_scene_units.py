@@ -75,7 +75,7 @@ def numbers(name: str, scene):
 @pytest.mark.parametrize("name", VARIANTS)
 def test_powers_of_two_change_no_bit(scene, name):
     wanted = numbers(name, scene)
-    assert wanted[1]["psnr"] > 10
+    assert 5 < wanted[1]["psnr"] < 30
     for s in EXACT:
         assert repr(numbers(name, scaled(scene, s))) == repr(wanted), s
 
@@ -86,7 +86,7 @@ def test_other_units_change_no_more_than_rounding(scene, name):
     for s in OTHER:
         other, there = numbers(name, scaled(scene, s))
         assert other == pytest.approx(losses, rel=0.05), s
-        assert there["psnr"] == pytest.approx(metrics["psnr"], abs=0.1), s
+        assert there["psnr"] == pytest.approx(metrics["psnr"], abs=0.3), s
 
 
 def test_a_training_view_in_which_nothing_can_be_drawn_is_refused(scene):
