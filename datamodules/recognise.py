@@ -48,10 +48,23 @@ FORMATS = {
     "blender": _Format(
         "transforms", "transforms_train.json", reader="read_blender", recogniser="recognise_blender"
     ),
+    "neus": _Format("neus", "cameras_sphere.npz or cameras.npz of NeuS and IDR, image and mask"),
     "colmap": _Format("colmap", "a COLMAP model and images"),
     "llff": _Format("llff", "poses_bounds.npy and images"),
 }
 """Names for --data-format."""
+
+_ELSEWHERE = {
+    "meta_data.json": "SDFStudio's, which is not read: write its camtoworld and intrinsics into a transforms.json "
+    'as transform_matrix and intrinsic_matrix, with "from_na": true',
+    "cameras.xml": "Metashape's, which is not read: export COLMAP's format, or run ns-process-data metashape",
+    "cameras.json": "the record of a trained Gaussian model: the scene is the folder that it was trained on",
+    "bundle.out": "Bundler's, which is not read: export COLMAP's format",
+    "reconstruction.json": "OpenSfM's, which is not read: opensfm export_colmap",
+    "cams": "MVSNet's, which is not read: give the COLMAP model that it was made from",
+    "database.db": "COLMAP's database of features: run colmap mapper, which writes sparse/0",
+}
+"""Files by which neighbouring programs' captures are known, and what to do with them."""
 
 
 def load(
@@ -204,6 +217,9 @@ def _guess(root: Path) -> str:
             return f"one level too high: {folder} looks like a scene"
     if root.name in ("images", "masks", "sparse", "0", "rgbs", "matting"):
         return "one level too deep: the scene is the folder above"
+    for name, meaning in _ELSEWHERE.items():
+        if (root / name).exists():
+            return f"{name} is {meaning}"
     return (
         "it holds none of the files that the layouts are known by" if any(root.iterdir()) else "it is empty"
     )

@@ -1,14 +1,15 @@
 """transforms.json of Blender's NeRF scenes, nerfstudio and instant-ngp.
 
 transforms.json                            one file (nerfstudio, instant-ngp)
-transforms_{train,test}.json               or one per split (Blender); transforms_val.json is not used
+transforms_{train,test}.json               or one per split (Blender; transform_{train,test}.json will do)
 <file_path>                                photographs, with or without their extension
 masks/                                     foreground masks named after the photographs; or alpha channels
 
 Poses are camera-to-world with OpenGL axes (x right, y up, z backward), and stay in the file's world frame:
 `scale`, `offset` and `aabb_scale` of instant-ngp say how that program places the scene in its own box, and
 `applied_transform` of nerfstudio what was done to COLMAP's frame before. Angles and focal lengths after the
-formats' documentation; the principal point has its origin at the image's corner, as everywhere here.
+formats' documentation; the principal point has its origin at the image's corner, as everywhere here. NeuS2's
+dialect is read, too: a matrix of intrinsics per frame, and OpenCV's axes where `from_na` says so.
 """
 
 from __future__ import annotations
@@ -28,9 +29,11 @@ from datamodules.files.undistort import Distortion
 from datamodules.request import Request
 from datamodules.views import splits
 from datamodules.views.find_files import ImageFiles
-from visdom_plugin.errors import SceneError
+from visdom_plugin.errors import SceneError, list_some
 
-_LENS = ("x_fov", "y_fov", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy")
+_MATRICES = ("intrinsic_matrix", "intrinsics", "intrinsic", "K", "camera_intrinsics")
+"""Names under which other programs give a 3 x 3 or 4 x 4 matrix of intrinsics in pixels."""
+_LENS = ("x_fov", "y_fov", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy", "sk_x")
 _BENT = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
@@ -58,6 +61,8 @@ class Transforms:
     entries: tuple[Entry, ...]
     train: tuple[str, ...] | None = None
     test: tuple[str, ...] | None = None
+    convention: str = "opengl"
+    """Axes of the poses; NeuS2's `from_na` says OpenCV's."""
 
 
 def recognise(root: Path) -> str | None:
@@ -66,8 +71,9 @@ def recognise(root: Path) -> str | None:
 
 
 def recognise_blender(root: Path) -> str | None:
-    """transforms_train.json, or None."""
-    return "transforms_train.json" if (root / "transforms_train.json").exists() else None
+    """transforms_train.json or transform_train.json, or None."""
+    names = ("transforms_train.json", "transform_train.json")
+    return next((name for name in names if (root / name).exists()), None)
 
 
 def read(root: Path, request: Request) -> Capture:
@@ -77,10 +83,11 @@ def read(root: Path, request: Request) -> Capture:
 
 
 def read_blender(root: Path, request: Request) -> Capture:
-    """Reads transforms_train.json and, where it is there, transforms_test.json."""
-    names = ["transforms_train.json"]
-    if inside(root, "transforms_test.json", outside=request.allow_outside).exists():
-        names.append("transforms_test.json")
+    """Reads transforms_train.json (or transform_train.json) and, where it is there, the file of the test views."""
+    names = [recognise_blender(root) or "transforms_train.json"]
+    test = names[0].replace("train", "test")
+    if inside(root, test, outside=request.allow_outside).exists():
+        names.append(test)
     return make_capture(root, request, "blender", [read_transforms(root, name, request) for name in names])
 
 
@@ -108,18 +115,24 @@ def parse_transforms(data: bytes, path: Path) -> Transforms:
         if value is not None and not isinstance(value, list):
             damaged(path, f"{key} is no list of names")
         lists[key] = None if value is None else tuple(_normalise(text(v, key, path)) for v in value)
-    return Transforms(path, _numbers(content, _LENS, path), entries, *lists.values())
+    axes = "opencv" if content.get("from_na") else "opengl"
+    shared = _lens_numbers(content, "the file", path)
+    return Transforms(path, shared, entries, lists["train_filenames"], lists["test_filenames"], axes)
 
 
 def _entry(frame: Any, index: int, content: dict[str, Any], path: Path) -> Entry:
     if not isinstance(frame, dict):
         damaged(path, f"frame {index} is no object")
     what = f"of frame {index}"
-    if "transform_matrix" not in frame and "transform_matrix_start" in frame:
-        damaged(
-            path,
-            f"frame {index} has a rolling shutter, which cannot be used",
-            cause="a video, not photographs",
+    if "transform_matrix" not in frame:
+        rolling = "transform_matrix_start" in frame
+        raise SceneError(
+            f"frame {index} has no transform_matrix; it has {list_some(sorted(frame), 12)}",
+            where=path,
+            cause="a rolling shutter: a video, not photographs"
+            if rolling
+            else "another program's form of the file",
+            todo="give each photograph one camera-to-world matrix (x right, y up, z backward) as transform_matrix",
         )
     width, height = (frame.get(key, content.get(key)) for key in ("w", "h"))
     if (width is None) != (height is None):
@@ -128,7 +141,7 @@ def _entry(frame: Any, index: int, content: dict[str, Any], path: Path) -> Entry
     return Entry(
         _normalise(text(frame.get("file_path"), f"file_path {what}", path)),
         matrix(frame.get("transform_matrix"), f"transform_matrix {what}", path),
-        _numbers(frame, _LENS, path),
+        _lens_numbers(frame, f"frame {index}", path),
         None if width is None else (size(width, f"w {what}", path), size(height, f"h {what}", path)),
         _distortion(content | frame, what, path),
         *(
@@ -138,8 +151,30 @@ def _entry(frame: Any, index: int, content: dict[str, Any], path: Path) -> Entry
     )
 
 
-def _numbers(scope: dict[str, Any], keys: Sequence[str], path: Path) -> dict[str, float]:
-    return {key: number(scope[key], key, path) for key in keys if scope.get(key) is not None}
+def _lens_numbers(scope: dict[str, Any], what: str, path: Path) -> dict[str, float]:
+    """Numbers of the lens that a frame gives, or the file for all; a matrix of intrinsics as fl_x and so on."""
+    found = {key: number(scope[key], key, path) for key in _LENS if scope.get(key) is not None}
+    for key in _MATRICES:
+        if scope.get(key) is not None:
+            rows = scope[key] if isinstance(scope[key], list) else []
+            if len(rows) not in (3, 4) or any(not isinstance(r, list) or len(r) not in (3, 4) for r in rows):
+                damaged(
+                    path,
+                    f"{key} of {what} is no 3 x 3 or 4 x 4 matrix",
+                    cause="a wrongly written file",
+                )
+            (fx, skew, cx), (_, fy, cy) = ([number(x, key, path) for x in row[:3]] for row in rows[:2])
+            found |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "sk_x": skew}
+    skew = found.pop("sk_x", 0.0)
+    odd = next((key for key in sorted(scope) if key.startswith("ftheta_") and scope[key] is not None), None)
+    if odd or abs(skew) > 0.01 * abs(found.get("fl_x", 1.0)):
+        raise SceneError(
+            f"{what} has {f'an f-theta lens ({odd})' if odd else f'skewed pixels (by {skew:g})'}",
+            where=path,
+            cause="a lens that cannot be undistorted here",
+            todo="undistort the photographs and give a pinhole: fl_x, fl_y, cx, cy",
+        )
+    return found
 
 
 def _normalise(name: str) -> str:
@@ -216,7 +251,7 @@ def make_capture(
             [dimensions for _, dimensions in lenses],
             names=[ordered[i].name for i in wanted],
             where=files[0].path,
-            convention="opengl",
+            convention=files[0].convention,
         )
         return Calibration(cameras, [entry.distortion for entry in entries])
 
@@ -284,10 +319,12 @@ def _lens(
     both = {**file.shared, **entry.own}
     focal = _focal(entry.own, dimensions) or _focal(file.shared, dimensions)
     if focal is None:
-        damaged(
-            file.path,
-            f"there is no focal length for {printable(frame.name)}: none of fl_x, camera_angle_x, x_fov",
-            cause="a file of another kind",
+        raise SceneError(
+            f"there is no focal length for {printable(frame.name)}: none of fl_x, camera_angle_x, x_fov, "
+            "intrinsic_matrix",
+            where=file.path,
+            cause="another program's dialect",
+            todo="give fl_x, fl_y, cx, cy in pixels, for the file or in each frame",
         )
     return (*focal, both.get("cx", dimensions[0] / 2), both.get("cy", dimensions[1] / 2)), dimensions
 

@@ -147,6 +147,7 @@ def test_what_a_reading_may_hold_reaches_the_run():
         "test_list": "2",
         "frame": 3,
         "masks": "outlines",
+        "colmap_model": "sparse/1",
         "mask_path": "foreground",
         "allow_outside": True,
         "split": "visdom",
