@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.losses import composite_target, mask_loss, photometric_loss
 from visdom_plugin.render import Render
+from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.set_config import GaussianSetConfig
 from visdom_plugin.training.protocols import ViewBatch
+
+_TRANSPARENT = -20.0
+"""Opacity logit of a Gaussian that is left out: nothing of it is drawn, and it has no gradient."""
 
 
 def fit_view(
@@ -30,6 +36,20 @@ def fit_view(
     if config.mask_weight and batch.mask_known:
         losses["mask"] = config.mask_weight * mask_loss(render.alpha, batch.mask, weight)
     return losses, -10 * mse.clamp_min(1e-10).log10()
+
+
+def drop_some(gaussians: Gaussians, rate: float, generator: Generator) -> Gaussians:
+    """Gaussians of which a random share is transparent and the rest 1 / (1 - rate) times as opaque, at most 0.995.
+
+    Args:
+        rate: the share, in [0, 1); at 0 they stay as they are.
+    """
+    if not rate:
+        return gaussians
+    logits = gaussians.opacity_logits
+    kept = torch.rand(len(gaussians), generator=generator).to(logits.device) >= rate
+    opacity = (logits.sigmoid() / (1 - rate)).clamp(1e-6, 0.995)
+    return replace(gaussians, opacity_logits=torch.where(kept, opacity.logit(), _TRANSPARENT))
 
 
 def draw_background(config: GaussianSetConfig, generator: Generator, device: torch.device) -> Tensor:

@@ -14,7 +14,7 @@ from visdom_plugin.validation import demand
 
 @dataclass(frozen=True)
 class HullStartConfig(GaussianSetConfig):
-    """Where Gaussians start, and the visible-domain hook."""
+    """What all methods of Gaussians take: where they start, what helps at few views, the visible-domain hook."""
 
     hull: VisibleDomain | None = field(default_factory=lambda: VisibleDomain(kind="released-go"))
     """Where the Gaussians start; None for the points of structure from motion, where the scene has them."""
@@ -23,8 +23,28 @@ class HullStartConfig(GaussianSetConfig):
     hull stays what the hook's loss, the removal of Gaussians and the metrics go by."""
     inside: InsideConfig = field(default_factory=InsideConfig)
     """How that shape is found."""
+    virtual_weight: float = 0.0
+    """Weight of the mean absolute difference, in a view between two training cameras, to the photographs warped
+    over that shape (over the hull where it is not asked for); beside it nothing is to be seen."""
+    dropout: float = 0.0
+    """Share of the Gaussians that a step leaves out at random, grown linearly to this value at the end; the others
+    are the more opaque for it (Park et al., DropGaussian, CVPR 2025)."""
     vd: RegularizerConfig = field(default_factory=RegularizerConfig)
     """The visible-domain hook; of two sets of Gaussians each has its loss."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        shapeless = self.virtual_weight > 0 and self.hull is None
+        demand(
+            self,
+            {
+                "virtual_weight": (
+                    self.virtual_weight >= 0 and not shapeless,
+                    "0, or more where there is a hull",
+                ),
+                "dropout": (0 <= self.dropout < 1, "a share of at least 0, below 1"),
+            },
+        )
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.losses import photometric_loss
-from visdom_plugin.methods.splats.common import draw_background, fit_view
+from visdom_plugin.methods.splats.common import draw_background, drop_some, fit_view
 from visdom_plugin.methods.splats.configs import CorgsConfig
 from visdom_plugin.methods.splats.initial_points import draw_box, draw_points
 from visdom_plugin.methods.splats.pseudo_views import draw_between, draw_on_ellipse, fit_ellipse
@@ -76,7 +76,11 @@ class CorgsLite(SplatMethod[CorgsConfig]):
         c, done = self.config, step + 1
         degree = self.strategies[0].sh_degree(step)
         background = draw_background(c, seeding.generator(self.seed, "step", step), self.device)
-        sets = [one.gaussians() for one in self.sets]
+        rate = c.dropout * step / c.steps
+        sets = [
+            drop_some(one.gaussians(), rate, seeding.generator(self.seed, "dropout", i, step))
+            for i, one in enumerate(self.sets)
+        ]
 
         def show(gaussians: Gaussians, camera: Cameras) -> Render:
             return self.splats.draw(camera, background, gaussians, degree)
@@ -88,6 +92,11 @@ class CorgsLite(SplatMethod[CorgsConfig]):
             camera = self.pseudo_camera(step)
             first, second = (show(gaussians, camera).rgb for gaussians in sets)
             losses |= co_regularisation(first, second, c.ssim_weight, c.pseudo_weight)
+        if self.virtual is not None:
+            for i, gaussians in enumerate(sets):
+                draw = seeding.generator(self.seed, "virtual", step)
+                loss = self.virtual.loss(partial(show, gaussians), background, draw)
+                losses[f"virtual_{i}"] = c.virtual_weight * loss
         for h, hook in enumerate(self.hooks):
             for i, gaussians in enumerate(sets):
                 # The same numbers for both sets, so that the hook shows both the same views.

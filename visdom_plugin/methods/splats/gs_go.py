@@ -12,13 +12,15 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin import seeding
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.losses import disparity_loss
-from visdom_plugin.methods.splats.common import draw_background, fit_view
+from visdom_plugin.methods.splats.common import draw_background, drop_some, fit_view
 from visdom_plugin.methods.splats.configs import GsGoConfig
 from visdom_plugin.methods.splats.initial_points import draw_points
 from visdom_plugin.methods.splats.splat_method import SplatMethod
 from visdom_plugin.methods.splats.strategy import LargestGaussian, Schedule, Strategy, every
+from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.training.protocols import StepOutput, ViewBatch
 
@@ -41,21 +43,25 @@ class GsGo(SplatMethod[GsGoConfig]):
 
     def train_step(self, batch: ViewBatch, step: int) -> StepOutput:
         c = self.config
-        degree, gaussians = self.strategy.sh_degree(step), self.splats.gaussians()
+        degree, rate = self.strategy.sh_degree(step), c.dropout * step / c.steps
+        gaussians = drop_some(self.splats.gaussians(), rate, seeding.generator(self.seed, "dropout", step))
         background = draw_background(c, seeding.generator(self.seed, "step", step), self.device)
-        render = self.splats.draw(batch.camera, background, gaussians, degree)
+
+        def show(camera: Cameras) -> Render:
+            return self.splats.draw(camera, background, gaussians, degree)
+
+        render = show(batch.camera)
         losses, psnr = fit_view(render, batch, background, c)
         if c.depth_weight and batch.mono_depth is not None and batch.mask_known:
             object_mask = batch.mask if batch.weight is None else batch.mask * batch.weight
             depth = disparity_loss(render.depth, render.alpha, batch.mono_depth, object_mask)
             if depth is not None:
                 losses["depth"] = c.depth_weight * depth
+        if self.virtual is not None:
+            draw = seeding.generator(self.seed, "virtual", step)
+            losses["virtual"] = c.virtual_weight * self.virtual.loss(show, background, draw)
         for i, hook in enumerate(self.hooks):
-            losses |= hook.loss(
-                lambda camera: self.splats.draw(camera, background, gaussians, degree),
-                step,
-                seeding.generator(self.seed, "hook", i, step),
-            )
+            losses |= hook.loss(show, step, seeding.generator(self.seed, "hook", i, step))
         return StepOutput(losses, {"psnr": psnr}, [render])
 
     @torch.no_grad()

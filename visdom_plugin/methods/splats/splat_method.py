@@ -17,6 +17,7 @@ from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.splats.common import scene_extent
 from visdom_plugin.methods.splats.configs import CorgsConfig, GsGoConfig
+from visdom_plugin.methods.splats.virtual_views import VirtualViews
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
@@ -57,6 +58,8 @@ class SplatMethod(ABC, Generic[Config]):
             log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
             warm_up()
         self.unit = float(mean_distance(views.cameras.to("cpu", torch.float64))) or 1.0
+        wanted = self.config.virtual_weight > 0 and hull is not None
+        self.virtual = VirtualViews(hull.inner or hull, views) if wanted else None
         self.build(views, hull, generator(seed, "initial_points"))
         refuse_unseen(self.splats.means, views, NEAR * self.unit)
 
