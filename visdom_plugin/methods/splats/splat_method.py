@@ -58,8 +58,9 @@ class SplatMethod(ABC, Generic[Config]):
             log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
             warm_up()
         self.unit = float(mean_distance(views.cameras.to("cpu", torch.float64))) or 1.0
-        wanted = self.config.virtual_weight > 0 and hull is not None
-        self.virtual = VirtualViews(hull.inner or hull, views) if wanted else None
+        self.virtual: VirtualViews | None = None
+        if self.config.virtual_weight > 0 and hull is not None:
+            self.virtual = VirtualViews(hull.inner or hull, views)
         self.build(views, hull, generator(seed, "initial_points"))
         refuse_unseen(self.splats.means, views, NEAR * self.unit)
 
