@@ -19,7 +19,7 @@ from numba import extending, njit
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+Function = TypeVar("Function", bound=Callable[..., object])
 
 # Sums may be regrouped into vector lanes (the compiled order is fixed, so results repeat to the bit), but NaN
 # and infinity keep their meaning.
@@ -27,7 +27,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 # A function with these flags is always inlined (`forceinline`). Otherwise the process that compiles it calls the
 # copy compiled by itself, and every later process, which loads the caller from numba's cache, the copy optimised
 # once more inside the caller: the last bits would differ between a machine's first run and all others.
-_FAST: dict[str, Any] = {
+_FAST: Any = {
     "fastmath": {"reassoc", "contract", "nsz", "arcp"},
     "error_model": "numpy",
     "forceinline": True,
@@ -56,15 +56,13 @@ def kernel(
     return compile_later
 
 
-def fast_overload(stub: Callable[..., Any]) -> Callable[[Function], Function]:
+def fast_overload(stub: Callable[..., object]) -> Callable[[Function], Function]:
     """Makes kernels that call `stub` compile the function that the decorated one returns for its types."""
-
-    options: Any = _FAST
 
     def register(choose: Function) -> Function:
         # What stands behind the stub, for the stamp.
         stub.__dict__.update(__wrapped__=choose, targetoptions=_FAST)
-        return extending.overload(stub, jit_options=options)(choose)
+        return extending.overload(stub, jit_options=_FAST)(choose)
 
     return register
 
@@ -75,7 +73,7 @@ class _StampedCache(FunctionCache):
         self._dispatcher = dispatcher
         self._stamped = False
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def load_overload(self, sig: object, target_context: object) -> object:
         # numba looks here before it compiles and saves. At decoration, names that the function reads may still be
         # missing from its module.
         if not self._stamped:
@@ -91,15 +89,15 @@ class _StampedFile(IndexDataCacheFile):
     A process with other code may write to the same files; between its index and its data this one's may come.
     """
 
-    def save(self, key: Any, data: Any) -> None:
+    def save(self, key: object, data: object) -> None:
         super().save(key, (self._source_stamp, data))
 
-    def load(self, key: Any) -> Any:
+    def load(self, key: object) -> object:
         stamp, data = super().load(key) or (None, None)
         return data if stamp == self._source_stamp else None
 
 
-def fingerprint(function: Callable[..., Any]) -> str:
+def fingerprint(function: Callable[..., object]) -> str:
     """Hash of what a compiled function is made from: its code, that of the functions of its package (and of this
     one) that it reaches, and the constants they read."""
     digest = hashlib.sha256()

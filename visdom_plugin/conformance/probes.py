@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.conformance.subject import scene
-from visdom_plugin.geometry.cameras import look_at_point
-from visdom_plugin.hooks.protocols import RayBounds
+from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.hooks.protocols import Placed, RayBounds
+from visdom_plugin.hull.hull import Hull
+from visdom_plugin.render import Render
+from visdom_plugin.training.protocols import Method, PixelBatch, ViewBatch
 
 
 class SamplerProbe:
@@ -27,7 +30,7 @@ class SamplerProbe:
         self.calls = 0
         self.centre = look_at_point(scene().train.cameras)
 
-    def bound(self, origins: Tensor, directions: Tensor, near: Any, far: Any) -> RayBounds:
+    def bound(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> RayBounds:
         self.calls += 1
         shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
         near, far = (torch.as_tensor(x).to(directions).expand(shape) for x in (near, far))
@@ -54,10 +57,10 @@ class GaussianProbe:
 
     LOSS = "conformance_probe"
 
-    def __init__(self, hull: Any):
+    def __init__(self, hull: Hull):
         self.hull = hull
         self.points: list[Tensor] = []
-        self.renders: list[Any] = []
+        self.renders: list[Render] = []
         self.seen: dict[int, list[Tensor]] = {}
         """Means of the Gaussians of each call of `after_step`, by step."""
         self.marked: dict[int, list[Tensor]] = {}
@@ -68,12 +71,12 @@ class GaussianProbe:
         self.points.append(xyz)
         return xyz, torch.full_like(xyz, 0.5)
 
-    def loss(self, render: Any, step: int, generator: Generator) -> dict[str, Tensor]:
+    def loss(self, render: Callable[[Cameras], Render], step: int, generator: Generator) -> dict[str, Tensor]:
         shown = render(scene().train.cameras[0])
         self.renders.append(shown)
         return {self.LOSS: 0.01 * shown.alpha.mean()}
 
-    def after_step(self, gaussians: Any, step: int) -> Tensor:
+    def after_step(self, gaussians: Placed, step: int) -> Tensor:
         means = gaussians.means.detach().clone()
         gone = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         gone[::10] = True
@@ -82,7 +85,7 @@ class GaussianProbe:
         return gone
 
 
-def gradient(method: Any, batch: Any, step: int) -> dict[int, Tensor]:
+def gradient(method: Method, batch: PixelBatch | ViewBatch, step: int) -> dict[int, Tensor]:
     """What `train_step` says of the parameters, by their identity: leaves of the losses' graph, no step taken."""
     total = method.train_step(batch, step).total
     leaves, seen = {}, set()

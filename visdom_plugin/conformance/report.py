@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
 
-def require(holds: bool, what: str, promise: Callable[..., Any] | type, todo: str) -> None:
+def require(holds: bool, what: str, promise: Callable[..., object] | type, todo: str) -> None:
     """Fails the check, without a traceback into this package, unless it holds.
 
     Args:
@@ -25,5 +24,5 @@ def require(holds: bool, what: str, promise: Callable[..., Any] | type, todo: st
         )
 
 
-def _place(promise: Callable[..., Any] | type) -> str:
+def _place(promise: Callable[..., object] | type) -> str:
     return f"{inspect.getsourcefile(promise)}:{inspect.getsourcelines(promise)[1]}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from typing import Any
@@ -15,6 +16,8 @@ from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
 from visdom_plugin.conformance.report import require
 from visdom_plugin.errors import list_some
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.registry import Preset, Registry
 from visdom_plugin.scene import Scene
 from visdom_plugin.training.batches import DataManager
@@ -37,7 +40,7 @@ def scene() -> Scene:
 
 
 @cache
-def carve(domain: Any) -> Any:
+def carve(domain: VisibleDomain) -> Hull:
     """The hull of the training views; each domain once."""
     return domain.carve(*scene().train.silhouettes())
 
@@ -46,7 +49,7 @@ def carve(domain: Any) -> Any:
 class Run:
     """A method that was trained, and what was seen on the way."""
 
-    method: Any
+    method: Method
     states: dict[int, State]
     """Copies of the state after so many steps."""
     losses: list[dict[str, Tensor]]
@@ -75,8 +78,12 @@ class Subject:
         self.config: Any = self.main.quick
 
     def start(
-        self, config: Any = None, hooks: list[Any] | None = None, device: torch.device = CPU, luck: int = 0
-    ) -> Any:
+        self,
+        config: Any = None,
+        hooks: Sequence[object] | None = None,
+        device: torch.device = CPU,
+        luck: int = 0,
+    ) -> Method:
         """A method, set up as a training run does it; with other hooks if they are given. `luck` as in `run`."""
         config = self.config if config is None else config
         domain = getattr(config, "hull", None)
@@ -88,12 +95,12 @@ class Subject:
         method.setup(views, hooks, hull=hull, device=device, seed=0)
         return method
 
-    def make_hook(self, device: torch.device = CPU) -> Any:
+    def make_hook(self, device: torch.device = CPU) -> object:
         """A new hook, as the variant with the hook gets it."""
         (hook,) = make_hooks(self.config, carve(self.config.hull), scene().train)
         return hook
 
-    def run(self, method: Any, first: int, last: int, keep: tuple[int, ...] = (), luck: int = 0) -> Run:
+    def run(self, method: Method, first: int, last: int, keep: tuple[int, ...] = (), luck: int = 0) -> Run:
         """Trains from step `first` to before `last`.
 
         Args:
@@ -158,7 +165,7 @@ class Subject:
         return replace(bare, **changes)
 
 
-def copy_state(method: Any) -> State:
+def copy_state(method: Method) -> State:
     """The state now, apart from what the method goes on to change."""
     return {k: v.detach().clone() for k, v in method.state_dict().items()}
 
@@ -170,7 +177,7 @@ def seed_all(seed: int) -> None:
     random.seed(seed)
 
 
-def global_luck() -> list[Any]:
+def global_luck() -> list[object]:
     """The state of all global generators."""
     twister = np.random.get_state(legacy=False)["state"]  # noqa: NPY002
     return [torch.get_rng_state().tolist(), twister["key"].tolist(), twister["pos"], random.getstate()]
@@ -195,7 +202,7 @@ def _same_nan(value: Tensor, twin: Tensor) -> bool:
     return value.is_floating_point() and torch.equal(value.nan_to_num(), twin.nan_to_num())
 
 
-def mass_outside(method: Any, hull: Any) -> float:
+def mass_outside(method: Method, hull: Hull) -> float:
     """`outside_hull_mass`, the mean over the test views."""
     cameras = scene().test.cameras
     shares = [

@@ -198,14 +198,14 @@ def with_settings(subject, **settings: bool) -> Any:
         return None
 
 
-def train_with(subject, probe: SamplerProbe, config: Any = None) -> Any:
+def train_with(subject, probe: SamplerProbe, config: Any = None) -> Method:
     """The method, half trained with a probe in the hook's place."""
     method = subject.start(config, hooks=[probe])
     subject.run(method, 0, subject.half)
     return method
 
 
-def pull_of(method: Any, step: int) -> Callable[[], float]:
+def pull_of(method: Method, step: int) -> Callable[[], float]:
     """How much pixels that show no object pull at the field, whenever it is asked: always the same pixels."""
     batch_of = choose_batches(method, DataManager(scene().train, 0))
     # Two batches: what both have in common, such as the decay of parameters, does not come from the rays.

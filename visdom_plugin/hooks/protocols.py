@@ -7,7 +7,7 @@ are handed callables. Several hooks are a list, applied in order.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from torch import Generator, Tensor
 
@@ -89,6 +89,22 @@ def sample_filters(hooks: Sequence[object]) -> list[SampleFilter]:
     return [hook for hook in hooks if isinstance(hook, SampleFilter) and hook.drop_outside]
 
 
+class Placed(Protocol):
+    """Gaussians, as far as hooks know them."""
+
+    @property
+    def means(self) -> Tensor:
+        """(N, 3) centres, world frame."""
+        ...
+
+
+class Means(NamedTuple):
+    """Gaussians of a trainer that has no object for them."""
+
+    means: Tensor
+    """(N, 3) centres, world frame."""
+
+
 @runtime_checkable
 class GaussianHook(Protocol):
     """What Gaussian splatting methods call at the start, for the loss, and after each step.
@@ -107,8 +123,8 @@ class GaussianHook(Protocol):
         """
         ...
 
-    def after_step(self, gaussians: Any, step: int) -> Tensor | None:
-        """Called after the optimiser's step with the method's Gaussians (`.means` (N, 3) at least).
+    def after_step(self, gaussians: Placed, step: int) -> Tensor | None:
+        """Called after the optimiser's step with the method's Gaussians.
 
         Returns (N,) bool, True for Gaussians the method should remove, or None.
         """

@@ -16,6 +16,7 @@ from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.camera_paths import interpolate
 from visdom_plugin.geometry.cameras import Cameras, project, require_batch
 from visdom_plugin.geometry.local_frame import is_near
+from visdom_plugin.hooks.protocols import Placed
 from visdom_plugin.hooks.settings import RegularizerSettings
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.point_colours import check_images, colour_points
@@ -52,7 +53,7 @@ class Opacity(Protocol):
         ...
 
 
-def _opacity(drawn: Any, shape: torch.Size) -> Tensor:
+def _opacity(drawn: Opacity | Tensor, shape: torch.Size) -> Tensor:
     """Opacity of what a renderer returned, without the dimensions of size one that rasterisers add."""
     alpha = getattr(drawn, "alpha", drawn)
     if not isinstance(alpha, Tensor):
@@ -241,7 +242,7 @@ class VisDomGaussianRegularizer:
             self._bank[index] = camera.to(self._device), silhouette.to(self._device)
         return self._bank[index]
 
-    def after_step(self, gaussians: Any, step: int) -> Tensor | None:
+    def after_step(self, gaussians: Placed, step: int) -> Tensor | None:
         """(N,) bool, True for Gaussians the trainer should remove, or None when there is nothing to do.
 
         Warns once when they are all outside, which trainers take for no reason to remove them.

@@ -137,7 +137,7 @@ class VisDomSampler:
         """Whether `keep` has a say: a method that can shall then ask it about each sample."""
         return self.config.drop_outside
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__.update(state)
         self._number = torch_ops.enter(self)
 

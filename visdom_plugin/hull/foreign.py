@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from visdom_plugin.errors import ConfigError, EmptyHullError
 
+Corners = Tensor | np.ndarray | Sequence[Tensor | npt.ArrayLike]
+"""(2, 3) lower and upper corner."""
 
-def check_grid(array: Any, where: object) -> np.ndarray:
+
+def check_grid(array: Tensor | npt.ArrayLike, where: object) -> np.ndarray:
     """(X, Y, Z) bool copy of a tensor or array of bool or numbers, of which those above 0.5 are inside.
 
     Raises:
         ConfigError: for another shape or kind, or numbers that are not finite.
         EmptyHullError: when nothing is inside.
     """
-    array = _to_numpy(array)
+    array = to_numpy(array)
     if array.ndim != 3 or array.size == 0:
         raise ConfigError(
             f"a hull needs a grid (X, Y, Z), not shape {array.shape}",
@@ -45,16 +49,17 @@ def check_grid(array: Any, where: object) -> np.ndarray:
     return np.ascontiguousarray(occupancy)
 
 
-def check_bounds(bounds: Any, where: object) -> np.ndarray:
+def check_bounds(bounds: Corners, where: object) -> np.ndarray:
     """(2, 3) float64 lower and upper corner.
 
     Raises:
         ConfigError: for another shape, numbers that are not finite, or corners without extent between them.
     """
     try:
-        if not isinstance(bounds, Tensor | np.ndarray):
-            bounds = [_to_numpy(corner).tolist() for corner in bounds]
-        bounds = np.array(_to_numpy(bounds), np.float64)
+        if isinstance(bounds, Tensor | np.ndarray):
+            bounds = np.array(to_numpy(bounds), np.float64)
+        else:
+            bounds = np.array([to_numpy(corner).tolist() for corner in bounds], np.float64)
     except (TypeError, ValueError) as error:
         raise ConfigError(
             f"bounds {bounds!r} are not two corners",
@@ -71,7 +76,8 @@ def check_bounds(bounds: Any, where: object) -> np.ndarray:
     return bounds
 
 
-def _to_numpy(value: Any) -> np.ndarray:
+def to_numpy(value: Tensor | npt.ArrayLike) -> np.ndarray:
+    """A tensor on any device, with or without gradient, or what numpy takes for an array, as an array."""
     if isinstance(value, Tensor):
         value = value.detach().cpu()
         half = value.dtype in (torch.float16, torch.bfloat16)

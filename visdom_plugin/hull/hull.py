@@ -8,19 +8,22 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, TypeVar, cast, overload
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.atomic_files import appearing, write_bytes
 from visdom_plugin.errors import CheckpointError
 from visdom_plugin.geometry.mesh_files import mesh_ply
-from visdom_plugin.hull.foreign import check_bounds, check_grid
+from visdom_plugin.hull.foreign import Corners, check_bounds, check_grid
 from visdom_plugin.hull.grid.mesh import mesh_grid
 
 _SCHEMA = 1
+Points = np.ndarray | Sequence[float] | Sequence[Sequence[float]]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +43,7 @@ class Hull:
     inner: Hull | None = None
     """The shape inside it, where somebody found it (`hull.inside.shape.shape_inside`): where Gaussians may start.
     The hull itself is what is certain, and is all that `save` writes."""
-    _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
+    _derived: dict[object, object] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", np.array(self.bounds, np.float64))
@@ -48,7 +51,9 @@ class Hull:
         _freeze(self.occupancy, self.bounds)
 
     @classmethod
-    def from_grid(cls, array: Any, bounds: Any, summary: dict[str, Any] | None = None) -> Hull:
+    def from_grid(
+        cls, array: Tensor | npt.ArrayLike, bounds: Corners, summary: dict[str, Any] | None = None
+    ) -> Hull:
         """A hull from any occupancy grid; the array is copied.
 
         Args:
@@ -64,20 +69,26 @@ class Hull:
         return cls._checked(array, bounds, "Hull.from_grid", summary)
 
     @classmethod
-    def _checked(cls, array: Any, bounds: Any, where: object, summary: dict[str, Any] | None = None) -> Hull:
+    def _checked(
+        cls,
+        array: Tensor | npt.ArrayLike,
+        bounds: Corners,
+        where: object,
+        summary: dict[str, Any] | None = None,
+    ) -> Hull:
         return cls(check_grid(array, where), check_bounds(bounds, where), summary or {})
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return self.__dict__ | {"_derived": {}}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__.update(state)
         _freeze(self.occupancy, self.bounds)
 
-    def _once(self, key: object, make: Callable[[], Any]) -> Any:
+    def _once(self, key: object, make: Callable[[], T]) -> T:
         if key not in self._derived:
             self._derived[key] = make()
-        return self._derived[key]
+        return cast(T, self._derived[key])
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Hull):
@@ -157,11 +168,9 @@ class Hull:
     def contains(self, points: Tensor, *, margin_voxels: float = 0.0) -> Tensor: ...
 
     @overload
-    def contains(self, points: np.ndarray | Sequence[Any], *, margin_voxels: float = 0.0) -> np.ndarray: ...
+    def contains(self, points: Points, *, margin_voxels: float = 0.0) -> np.ndarray: ...
 
-    def contains(
-        self, points: Tensor | np.ndarray | Sequence[Any], *, margin_voxels: float = 0.0
-    ) -> Tensor | np.ndarray:
+    def contains(self, points: Tensor | Points, *, margin_voxels: float = 0.0) -> Tensor | np.ndarray:
         """Whether points lie in occupied voxels. Points outside the grid do not.
 
         Args:
@@ -210,12 +219,14 @@ class Hull:
             from outside), every edge in exactly two faces. Both are read-only.
         """
 
-        def make() -> tuple[np.ndarray, ...]:
+        def make() -> tuple[np.ndarray, np.ndarray]:
             lower, upper = occupied_box(self.occupancy).astype(int)
             window = tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))
             # A copy also where the window is the whole grid: its kernel is compiled for writable arrays.
             vertices, faces = mesh_grid(self.occupancy[window].copy())
-            return _freeze(self.bounds[0] + (vertices + lower) * self.voxel_edges, faces)
+            vertices = self.bounds[0] + (vertices + lower) * self.voxel_edges
+            _freeze(vertices, faces)
+            return vertices, faces
 
         return self._once("mesh", make)
 
@@ -322,10 +333,9 @@ class Hull:
         write_bytes(Path(path), mesh_ply(*self.to_mesh()))
 
 
-def _freeze(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+def _freeze(*arrays: np.ndarray) -> None:
     for array in arrays:
         array.flags.writeable = False
-    return arrays
 
 
 def occupied_box(occupancy: np.ndarray) -> np.ndarray:

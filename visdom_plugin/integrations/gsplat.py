@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, MutableMapping
 from importlib.metadata import version
-from types import SimpleNamespace
-from typing import Any, Literal
+from types import ModuleType
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,13 +16,17 @@ from torch import Tensor
 from visdom_plugin.errors import CheckpointError, ConfigError, PluginError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.geometry.local_frame import require_near
-from visdom_plugin.hooks.regularizer import VisDomGaussianRegularizer
+from visdom_plugin.hooks.protocols import Means
+from visdom_plugin.hooks.regularizer import Opacity, VisDomGaussianRegularizer
 from visdom_plugin.render import Render
 from visdom_plugin.seeding import generator
 
 FADED_OPACITY = 0.004
 """What is left of a faded Gaussian. MCMCStrategy counts what is below its `min_opacity` of 0.005 as dead and moves
 it to a living one."""
+Params = MutableMapping[str, torch.nn.Parameter]
+Optimizers = Mapping[str, torch.optim.Optimizer]
+State = dict[str, object]
 _CEILING = math.log(FADED_OPACITY / (1 - FADED_OPACITY))
 
 
@@ -60,7 +64,7 @@ class VisDomStrategy:
         hook: VisDomGaussianRegularizer,
         *,
         outside: Literal["auto", "remove", "fade", "keep"] = "auto",
-        render: Callable[[dict, Cameras], Any] | None = None,
+        render: Callable[[Params, Cameras], Opacity | Tensor] | None = None,
         seed: int = 0,
     ):
         if outside not in ("auto", "remove", "fade", "keep"):
@@ -71,7 +75,7 @@ class VisDomStrategy:
         self.ended = 0
         """Gaussians removed or faded so far; one that MCMCStrategy revives outside counts again."""
 
-    def initialize_state(self, state: dict[str, Any] | None = None) -> dict[str, Any]:
+    def initialize_state(self, state: State | None = None) -> State:
         """Starts counting anew. Returns the other strategy's running state, which both share."""
         self.ended = 0
         return {} if state is None else state
@@ -80,16 +84,26 @@ class VisDomStrategy:
         """Where Gaussians start: xyz (n, 3) and rgb (n, 3) in [0, 1]."""
         return self.hook.initial_points(n, generator(self.seed, "initial_points"))
 
-    def step_pre_backward(self, params, optimizers, state, step: int, info=None) -> Tensor:
+    def step_pre_backward(
+        self, params: Params, optimizers: Optimizers, state: State, step: int, info: State | None = None
+    ) -> Tensor:
         """The loss to add, a scalar; zero on steps without it."""
         draw = generator(self.seed, "gsplat", step)
         losses = self.hook.loss(lambda camera: self.render(params, camera), step, draw)
         return sum(losses.values(), params["means"].new_zeros(()))
 
     @torch.no_grad()
-    def step_post_backward(self, params, optimizers, state, step: int, info=None, **_) -> int:
+    def step_post_backward(
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        state: State,
+        step: int,
+        info: State | None = None,
+        **_: object,
+    ) -> int:
         """Ends Gaussians outside the hull, `params`, `optimizers` and `state` alike; returns how many."""
-        gone = self.hook.after_step(SimpleNamespace(means=params["means"]), step)
+        gone = self.hook.after_step(Means(params["means"]), step)
         policy = ("fade" if "binoms" in state else "remove") if self.outside == "auto" else self.outside
         if gone is None or policy == "keep" or not bool(gone.any()) or bool(gone.all()):
             return 0
@@ -101,13 +115,13 @@ class VisDomStrategy:
         self.ended += int(gone.sum())
         return int(gone.sum())
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, int]:
         """What a resumed run needs: plain numbers. The trainer keeps `state` itself."""
         hull = self.hook.hull
         check = zlib.crc32(np.packbits(hull.occupancy).tobytes() + hull.bounds.tobytes())
         return {"seed": self.seed, "ended": self.ended, "hull": check}
 
-    def load_state_dict(self, saved: dict[str, Any]) -> None:
+    def load_state_dict(self, saved: Mapping[str, int]) -> None:
         """Takes over what `state_dict` gave.
 
         Raises:
@@ -123,7 +137,7 @@ class VisDomStrategy:
         self.ended = saved["ended"]
 
 
-def draw_opacity(params, camera: Cameras) -> Tensor:
+def draw_opacity(params: Params, camera: Cameras) -> Tensor:
     """(H, W) opacity of gsplat's parameters by gsplat's own rasteriser, which needs CUDA."""
     rasterization = _gsplat().rasterization
     means = params["means"]
@@ -142,7 +156,7 @@ def draw_opacity(params, camera: Cameras) -> Tensor:
     return alphas[0, ..., 0]
 
 
-def info_of(render: Render) -> dict[str, Any]:
+def info_of(render: Render) -> State:
     """What gsplat's strategies want as `info`, of a view that `visdom_plugin.splat.rasterise` drew.
 
     Radii are (1, N, 2) from gsplat 1.5 on, (1, N) before.
@@ -184,7 +198,7 @@ def _fade(opacities: Tensor, optimizer: torch.optim.Optimizer, gone: Tensor) -> 
             value[gone] = 0
 
 
-def _remove(params, optimizers, state: dict[str, Any], gone: Tensor) -> None:
+def _remove(params: Params, optimizers: Optimizers, state: State, gone: Tensor) -> None:
     # Of the running state only what has one row per Gaussian; gsplat's `remove` would cut everything.
     rows = {
         key: value
@@ -195,7 +209,7 @@ def _remove(params, optimizers, state: dict[str, Any], gone: Tensor) -> None:
     state.update(rows)
 
 
-def _gsplat():
+def _gsplat() -> ModuleType:
     try:
         import gsplat
         import gsplat.strategy.ops

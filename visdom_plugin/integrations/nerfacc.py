@@ -6,7 +6,7 @@ Nothing here imports nerfacc: the estimator is the caller's.
 from __future__ import annotations
 
 from importlib.metadata import version
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -43,15 +43,28 @@ def ray_planes(
     return {"near_plane": limits["t_min"][:, None], "far_plane": limits["t_max"][:, None]}
 
 
+class Estimator(Protocol):
+    """What is asked of an `OccGridEstimator`."""
+
+    aabbs: Tensor
+    """(levels, 6) lower and upper corner of each level."""
+    resolution: Tensor
+    """(3,) cells along x, y, z."""
+    occs: Tensor
+    """(cells,)"""
+    binaries: Tensor
+    """(levels, X, Y, Z) bool."""
+
+
 @torch.no_grad()
-def confine(estimator: Any, hull: Hull, *, margin: float = 0.0) -> int:
+def confine(estimator: Estimator, hull: Hull, *, margin: float = 0.0) -> int:
     """Closes, for good, the cells of an `OccGridEstimator` that the hull does not reach.
 
     They get occupancy -1, which nerfacc's updates pass over, as they do after `mark_invisible_cells`; the mark is
     part of the estimator's state dict. Call it once, before training, with the estimator where it will stay.
 
     Args:
-        estimator: with `aabbs` (levels, 6), `resolution` (3,), `occs` (cells,) and `binaries` (levels, X, Y, Z).
+        estimator: nerfacc's own.
         hull: in the estimator's frame.
         margin: cells up to this far from the hull stay open, in scene units; `sampler.epsilon_world` leaves open
             what the sampler's band reaches.

@@ -18,6 +18,7 @@ from torch import Tensor
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras, require_batch
 from visdom_plugin.hull.carving.keep_rule import KeepRule
+from visdom_plugin.hull.foreign import to_numpy
 
 Device = torch.device | str
 Masks = Sequence[Tensor | np.ndarray] | Tensor | np.ndarray
@@ -94,7 +95,7 @@ def gather_silhouettes(cameras: Cameras, masks: Masks, dilate_px: int = 0) -> Si
     offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
     pixels = np.empty(int(counts.sum()), np.uint8)
     for view, mask in enumerate(masks):
-        mask = mask.detach().cpu().numpy() if isinstance(mask, Tensor) else np.asarray(mask)
+        mask = to_numpy(mask)
         width, height = sizes[view]
         if mask.shape != (height, width):
             raise SceneError(

@@ -33,6 +33,7 @@ from visdom_plugin.hull.checks.mask_checks import (
 )
 from visdom_plugin.hull.checks.pose_conventions import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.checks.silhouette_consistency import Coherence, measure_coherence
+from visdom_plugin.hull.foreign import to_numpy
 
 CLUSTERED_DEGREES = 60.0
 """Views within this angle leave a hull more than 1.7 times as deep as the object."""
@@ -83,8 +84,8 @@ def check(
         poses: what to say of wrong poses, in the terms of where they are from.
         set_k: how K is set there, with {k} for its value.
     """
-    own = [np.asarray(m.detach().cpu() if isinstance(m, Tensor) else m).astype(bool) for m in masks]
-    names = Name([f"view {i}" for i in range(len(own))] if names is None else names)
+    own = [to_numpy(m).astype(bool) for m in masks]
+    names = Name.numbered(len(own)) if names is None else Name(names)
     sizes = torch.stack([cameras.width, cameras.height], -1).cpu().numpy()
     found = check_sizes(sizes, own, names)
     out = {view for f in found for view in f.views}
@@ -189,7 +190,7 @@ def _inverted(
     whose = "all masks are" if len(views) == len(masks) else f"the mask of {names[views[0]]} is"
     if 1 < len(views) < len(masks):
         whose = f"the masks of {names.all_of(views)} are"
-    evidence = f"turned over, the masks fit together to {after.score / OBJECT_PX:.2%} of the object's length"
+    evidence = f"turned over, the masks fit together to {_share(after.score)} of the object's length"
     said = Finding(
         "inverted",
         f"{whose} foreground along most of the image's border: background is marked"
@@ -266,15 +267,10 @@ _TODO = {
 
 def _cause(cause: Suspicion, usable: np.ndarray, names: Name, poses: PoseFaults) -> Finding:
     views = tuple(int(usable[v]) for v in cause.views)
-    gain = (
-        f"undone, masks and cameras miss each other by {_share(cause.after)} of the object's length in the "
-    )
-    gain += f"mean in place of {_share(cause.before)}"
+    after = f"{_share(cause.after)} of the object's length in the mean"
+    gain = f"undone, masks and cameras miss each other by {after} in place of {_share(cause.before)}"
     if cause.kind == "view":
-        gain = (
-            f"without it the other views miss each other by {_share(cause.after)} of the object's length in "
-        )
-        gain += f"the mean, with it by {_share(cause.before)}"
+        gain = f"without it the other views miss each other by {after}, with it by {_share(cause.before)}"
         what = f"{names[views[0]]} does not fit the others"
         if cause.rivals:
             rivals = tuple(int(usable[v]) for v in cause.rivals)
@@ -289,8 +285,7 @@ def _cause(cause: Suspicion, usable: np.ndarray, names: Name, poses: PoseFaults)
         other = names.all_of([int(usable[v]) for v in others]) + ": " if others else ""
         what += f"; or {other}{detail}" if kind != "swapped" else f"; or {other}exchanged"
     if cause.before <= QUIET_PX:
-        gain = "as given, no view rules out anything for another; undone they do, and miss each other by "
-        gain += f"{_share(cause.after)} of the object's length in the mean"
+        gain = f"as given, no view rules out anything for another; undone they do, and miss each other by {after}"
     ratio = min(cause.after / max(cause.before, 1e-9), 1.0)
     sure: Sure = "certain" if cause.before > _DISAGREE_PX and ratio < 0.1 else "likely"
     sure = "possible" if cause.rivals or cause.others else sure

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras, rays_of
 from visdom_plugin.hull.carving.votes import Silhouettes
+from visdom_plugin.hull.foreign import to_numpy
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.hull.settings import HullSettings
@@ -40,7 +41,7 @@ def measure_coverage(hull: Hull, cameras: Cameras, masks: Sequence[Tensor | np.n
     result = []
     for view, mask in enumerate(masks):
         seen = depth_and_silhouette(hull, cameras[view].to("cpu"))[1].numpy()
-        mask = (mask.cpu().numpy() if isinstance(mask, Tensor) else np.asarray(mask)).astype(bool)
+        mask = to_numpy(mask).astype(bool)
         both, of_mask, of_hull = (int(np.count_nonzero(x)) for x in (seen & mask, mask, seen))
         result.append(Coverage(both / of_mask if of_mask else 1.0, both / of_hull if of_hull else 1.0))
     return result

@@ -64,8 +64,7 @@ def advise_k(
         shares = [hit[view == i].mean() if (view == i).any() else 1.0 for i in range(len(outlines))]
         covered[k] = np.array(shares)
     chosen = next(k for k in range(most, 1, -1) if (covered[k] >= covered[LEAST_K] - LOST).all())
-    names = Name([f"view {i}" for i in range(len(outlines))]) if names is None else names
-    return Advice(chosen, covered, _say(chosen, most, covered, names))
+    return Advice(chosen, covered, _say(chosen, most, covered, names or Name.numbered(len(outlines))))
 
 
 def _say(chosen: int, most: int, covered: dict[int, np.ndarray], names: Name) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import Silhouettes
+from visdom_plugin.hull.checks.mask_checks import object_length
 
 OBJECT_PX = 128
 """Pixels along the longest side of the typical mask that the fields are made for."""
@@ -64,14 +65,9 @@ def draw_outlines(cameras: Cameras, silhouettes: Silhouettes) -> Outlines:
     Args:
         cameras: (N,) the ones of `silhouettes`.
     """
-    sides, lengths = silhouettes.sizes.max(1), []
-    for view in range(len(silhouettes)):
-        mask = silhouettes.mask(view)
-        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        if len(rows):
-            extent = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
-            lengths.append(extent / sides[view])
-    longest = min(OBJECT_PX / float(np.median(lengths)), MOST_PX) if lengths else OBJECT_PX
+    sides = silhouettes.sizes.max(1)
+    lengths = np.array([object_length(silhouettes.mask(view)) for view in range(len(silhouettes))]) / sides
+    longest = min(OBJECT_PX / float(np.median(lengths[lengths > 0])), MOST_PX) if lengths.any() else OBJECT_PX
     fields, ratios = [], []
     for view in range(len(silhouettes)):
         mask = silhouettes.mask(view)

@@ -19,7 +19,7 @@ from visdom_plugin.hull.carving.carve import carve_silhouettes
 from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Silhouettes
 from visdom_plugin.hull.checks.check import check
-from visdom_plugin.hull.checks.coverage import POOR_COVERAGE, explains_enough, measure_coverage
+from visdom_plugin.hull.checks.coverage import POOR_COVERAGE, measure_coverage
 from visdom_plugin.hull.checks.covisibility import IN_COMMANDS, IN_PROGRAM, LEAST_K, USUAL_K
 from visdom_plugin.hull.checks.findings import Finding, Name
 from visdom_plugin.hull.hull import Hull
@@ -88,8 +88,6 @@ def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouett
     Raises:
         SceneError: when poses of another convention explain the masks, or the hull is a mere speck.
     """
-    if explains_enough(settings, cameras, silhouettes, hull):
-        return None
     cameras = cameras.to("cpu", dtype=torch.float64)
     covered = _mean_coverage(hull, cameras, silhouettes)
     if covered >= POOR_COVERAGE:
@@ -140,7 +138,7 @@ def _join(group: list[Finding]) -> Finding:
 def _where(fault: Finding) -> str | None:
     if not fault.views or fault.kind in _WHERE:
         return _WHERE.get(fault.kind)
-    return Name([f"view {i}" for i in range(max(fault.views) + 1)]).all_of(fault.views)
+    return Name.numbered(max(fault.views) + 1).all_of(fault.views)
 
 
 def _cause(fault: Finding) -> str:

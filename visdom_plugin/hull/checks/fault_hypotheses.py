@@ -87,38 +87,30 @@ def find_causes(
         if left.sum() < 2 or (fit.score <= QUIET_PX and (fit.power >= _LEAST_POWER_PX or left.sum() < 3)):
             break
         index = np.flatnonzero(left)
-        cause, changed, stays = _best_cause(outlines.keep(index), fit, rays, brief, poses)
-        if cause is None:
-            pair = _two_views(outlines.keep(index), fit, rays) if fit.score > QUIET_PX else None
-            if pair is None:
-                break
-            views, after = pair
-            found += [Suspicion("view", (int(index[v]),), "", fit.score, after) for v in views]
-            left[index[list(views)]] = False
-            fit = measure_coherence(outlines.keep(left), rays)
-            break
-        concerned = tuple(int(index[i]) for i in cause.views)
-        found.append(cause._replace(views=concerned, rivals=tuple(int(index[i]) for i in cause.rivals)))
-        if cause.kind == "view":
-            left[index[~stays]] = False
-            if cause.rivals:
-                break
-        else:
-            outlines = _put_back(outlines, index, changed)
-        if left.sum() < 2:
+        cause, changed = _best_cause(outlines.keep(index), fit, rays, brief, poses)
+        causes = _two_views(outlines.keep(index), fit, rays) if cause is None else [cause]
+        for c in causes:
+            concerned, rivals = (tuple(int(index[i]) for i in views) for views in (c.views, c.rivals))
+            found.append(c._replace(views=concerned, rivals=rivals))
+            if c.kind == "view":
+                left[list(concerned)] = False
+            else:
+                outlines = _put_back(outlines, index, changed)
+        if not causes or causes[0].rivals or left.sum() < 2:
             break
         fit = measure_coherence(outlines.keep(left), rays)
+        if len(causes) > 1:
+            break
     return found, fit, left
 
 
 def _best_cause(
     outlines: Outlines, fit: Coherence, rays: int, brief: bool, poses: PoseFaults
-) -> tuple[Suspicion | None, Outlines, np.ndarray]:
-    """The cause that explains most, the changed outlines and the views that stay; (None, ...) for none."""
+) -> tuple[Suspicion | None, Outlines]:
+    """The cause that explains most, or None, and the outlines with it undone."""
     count, before = len(outlines), fit.score
     silent = before <= QUIET_PX
     enough = QUIET_PX if silent else _RATIO * before
-    fewer = int(np.clip(_TRIAL_RAYS // count, 8, 64))
     alone = np.array([fit.score_without(i) for i in range(count)]) if count >= 3 else np.full(count, np.inf)
     culprit = int(np.argmin(alone))
     tried = []
@@ -127,12 +119,9 @@ def _best_cause(
         # Where masks are silent the principal points must speak: any longer lens makes views more selective.
         if silent and not (_off_centre(outlines) > _FAR_OFF and _off_centre(changed) < _FAR_OFF / 2):
             continue
-        # Few rays do to rule a trial out.
-        if measure_coherence(changed, fewer, 2.0, power=False).score <= 2 * enough:
-            after = measure_coherence(changed, rays)
-            if after.score <= enough:
-                tried.append((trial, changed, after))
-    stays = np.ones(count, bool)
+        after = _fits(changed, enough, rays)
+        if after is not None:
+            tried.append((trial, changed, after))
     alone_fits = alone[culprit] <= enough
     if tried:
         # Of those that fit about equally well, the ones that the masks leave least room for; the simplest first.
@@ -153,26 +142,26 @@ def _best_cause(
             )
         )
         if fits and after.power > _LEAST_POWER_PX:
-            return (
-                Suspicion(best.kind, best.views, best.detail, before, after.score, (), others),
-                changed,
-                stays,
-            )
+            return Suspicion(best.kind, best.views, best.detail, before, after.score, (), others), changed
     if silent or not alone_fits:
-        return None, outlines, stays
+        return None, outlines
     suspects = _closest({i: float(alone[i]) for i in range(count)})
     if len(suspects) > 1:
         # The object's place was found with the wrong view in it; found anew without each, it tells them apart.
         rest = {i: outlines.keep(np.arange(count) != i) for i in suspects}
         suspects = _closest({i: measure_coherence(rest[i], rays, power=False).score for i in suspects})
     culprit, *rivals = suspects
-    stays[culprit] = False
     detail = "" if rivals or brief else _explain_view(outlines, culprit, rays, fit, poses)
-    return (
-        Suspicion("view", (culprit,), detail, before, float(alone[culprit]), tuple(rivals)),
-        outlines,
-        stays,
-    )
+    return Suspicion("view", (culprit,), detail, before, float(alone[culprit]), tuple(rivals)), outlines
+
+
+def _fits(changed: Outlines, enough: float, rays: int) -> Coherence | None:
+    """How well changed views fit together, where that is well enough; few rays do to rule a change out."""
+    fewer = int(np.clip(_TRIAL_RAYS // len(changed), 8, 64))
+    if measure_coherence(changed, fewer, 2.0, power=False).score > 2 * enough:
+        return None
+    after = measure_coherence(changed, rays)
+    return after if after.score <= enough else None
 
 
 def _closest(scores: dict[int, float]) -> list[int]:
@@ -188,11 +177,11 @@ def _off_centre(outlines: Outlines) -> float:
     return float(np.median(np.abs(outlines.intrinsics[:, :2, 2] / sizes - 0.5).max(1)))
 
 
-def _two_views(outlines: Outlines, fit: Coherence, rays: int) -> tuple[tuple[int, int], float] | None:
-    """Two views without which the others fit, and how well; None when there is no such pair, or several."""
+def _two_views(outlines: Outlines, fit: Coherence, rays: int) -> list[Suspicion]:
+    """Two views without which the others fit; none when there is no such pair, or several."""
     count = len(outlines)
-    if count < _LEAST_FOR_TWO:
-        return None
+    if count < _LEAST_FOR_TWO or fit.score <= QUIET_PX:
+        return []
     scores = {}
     for first in np.argsort([fit.score_without(i) for i in range(count)])[:4].tolist():
         rest = np.delete(np.arange(count), first)
@@ -201,7 +190,7 @@ def _two_views(outlines: Outlines, fit: Coherence, rays: int) -> tuple[tuple[int
             scores[min(first, second), max(first, second)] = without.score_without(k)
     (views, after), (_, next_best) = sorted(scores.items(), key=lambda item: item[1])[:2]
     clear = after <= _RATIO * fit.score and 2 * after + _FLOOR_PX < next_best
-    return (views, after) if clear else None
+    return [Suspicion("view", (v,), "", fit.score, after) for v in views] if clear else []
 
 
 def _whole_trials(
@@ -242,18 +231,6 @@ def _whole_trials(
 
 def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence, poses: PoseFaults) -> str:
     """The change that would mend one view, in words; empty for none."""
-
-    def one(change: Change) -> Outlines:
-        changed = change(outlines)
-        fields = tuple(f if i != view else changed.fields[i] for i, f in enumerate(outlines.fields))
-        pick = np.arange(len(outlines)) == view
-        return Outlines(
-            np.where(pick[:, None, None], changed.rotations, outlines.rotations),
-            np.where(pick[:, None], changed.centres, outlines.centres),
-            np.where(pick[:, None, None], changed.intrinsics, outlines.intrinsics),
-            fields,
-        )
-
     trials = [(fault.what, change) for fault, change in zip(poses, _AXES, strict=True)]
     trials += [
         (
@@ -268,16 +245,12 @@ def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence, pose
         ("its mask is turned by 180 degrees", lambda o: _fields(o, lambda f: f[::-1, ::-1])),
         ("its mask is inverted", lambda o: _fields(o, lambda f: -f)),
     ]
-    alone, power = fit.score_without(view), fit.power_without(view)
-    best, said, enough = _GAIN * power, "", max(2 * alone, _FLOOR_PX)
-    fewer = int(np.clip(_TRIAL_RAYS // len(outlines), 8, 64))
+    best, said, index = _GAIN * fit.power_without(view), "", np.array([view])
+    enough = max(2 * fit.score_without(view), _FLOOR_PX)
     for detail, change in trials:
-        changed = one(change)
-        if measure_coherence(changed, fewer, 2.0, power=False).score > 2 * enough:
-            continue
-        after = measure_coherence(changed, rays)
+        after = _fits(_put_back(outlines, index, change(outlines.keep(index))), enough, rays)
         # A view that is mended narrows the hull down; one that merely falls silent does not.
-        if after.score <= enough and after.power > best and np.isfinite(after.whole[view]):
+        if after is not None and after.power > best and np.isfinite(after.whole[view]):
             best, said = after.power, detail
     return said
 

@@ -34,6 +34,11 @@ class Finding(NamedTuple):
 class Name(list[str]):
     """Names of views for sentences."""
 
+    @classmethod
+    def numbered(cls, count: int) -> Name:
+        """ "view 0", "view 1", ..., for views without names."""
+        return cls(f"view {i}" for i in range(count))
+
     def all_of(self, views: Sequence[int], most: int = 6) -> str:
         """ "a", "a and b", "a, b and c", "a, b, ... (9 in all)"."""
         names = [self[i] for i in views]

@@ -132,11 +132,13 @@ def _ring(mask: np.ndarray) -> np.ndarray:
 
 def border_contact(mask: np.ndarray) -> float:
     """Foreground pixels on the image's border, as a share of the object's longest side, at most 1."""
+    return min(float(np.count_nonzero(_ring(mask))) / max(object_length(mask), 1), 1.0)
+
+
+def object_length(mask: np.ndarray) -> int:
+    """Longest side, in pixels, of the box around a mask's (H, W) foreground; 0 for an empty mask."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if len(rows) == 0:
-        return 0.0
-    extent = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
-    return min(float(np.count_nonzero(_ring(mask))) / float(extent), 1.0)
+    return int(max(np.ptp(rows), np.ptp(columns))) + 1 if len(rows) else 0
 
 
 def count_specks(mask: np.ndarray) -> tuple[int, float]:

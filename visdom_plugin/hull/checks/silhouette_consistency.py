@@ -291,28 +291,23 @@ def measure_coherence(
         if power:
             around = choose_pixels(outlines, max(per_view // 2, 8), beside=True)
             beside = march_rays(outlines, *around, least=1, ball=ball, step_px=step_px)
-    contradicted = np.full(views, np.nan)
+    whole, without, contradicted = _means(found, views)
+    return Coherence(whole, without, *_means(beside, views)[:2], contradicted, ball)
+
+
+def _means(found: Residuals | None, views: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each view's rays: mean residuals (N,), with one view left out (N, N), and share contradicted (N,)."""
+    whole, contradicted, without = *np.full((2, views), np.nan), np.full((views, views), np.nan)
+    if found is None:
+        return whole, without, contradicted
     for i in range(views):
-        mine = _counted(found, i)
+        mine = (found.view == i) & (found.counts | (found.whole <= TOLERANCE_PX))
         if mine.any():
+            whole[i] = _excess(found.whole[mine]).mean()
+            without[i] = _excess(found.without[mine]).mean(0)
+            without[i, i] = np.nan
             contradicted[i] = (found.whole[mine] > TOLERANCE_PX).mean()
-    return Coherence(*_means(found, views), *_means(beside, views), contradicted, ball)
-
-
-def _counted(found: Residuals, view: int) -> np.ndarray:
-    return (found.view == view) & (found.counts | (found.whole <= TOLERANCE_PX))
-
-
-def _means(found: Residuals | None, views: int) -> tuple[np.ndarray, np.ndarray]:
-    whole, without = np.full(views, np.nan), np.full((views, views), np.nan)
-    if found is not None:
-        for i in range(views):
-            mine = _counted(found, i)
-            if mine.any():
-                whole[i] = _excess(found.whole[mine]).mean()
-                without[i] = _excess(found.without[mine]).mean(0)
-                without[i, i] = np.nan
-    return whole, without
+    return whole, without, contradicted
 
 
 def _mean(values: np.ndarray, otherwise: float = CAP_PX) -> float:

@@ -7,7 +7,7 @@ the masks (a loss), and training shows photographs on random colours with the ma
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
@@ -73,18 +73,19 @@ class RandomThenWhite(RGBRenderer):
         """Nerfstudio's constructor sets it."""
 
 
-def known_views(metadata: dict[str, Any] | None, method: str) -> TrainingViews:
+def known_views(metadata: dict[str, object] | None, method: str) -> TrainingViews:
     """The training views that the data parser handed on.
 
     Raises:
         ConfigError: for another data parser than ours.
     """
-    if not metadata or METADATA not in metadata:
+    known = (metadata or {}).get(METADATA)
+    if not isinstance(known, TrainingViews):
         raise ConfigError(
             f"{method} needs foreground masks, and this data parser hands on none",
             todo=f"use ours: ns-train {method} visdom --data DIR",
         )
-    return metadata[METADATA]
+    return known
 
 
 def rgba_mask_loss(accumulation: Tensor, image: Tensor) -> Tensor:

@@ -45,21 +45,6 @@ class Similarity(NamedTuple):
         centre = (motion[..., :3, 3] @ rotation.mT + shift) * self.scale
         return torch.cat([turned, centre[..., None]], -1)
 
-    def cameras_to_world(self, poses: Tensor, intrinsics: Tensor, width, height) -> Cameras:
-        """Our cameras of nerfstudio's: the inverse of `poses_to_model`.
-
-        Args:
-            poses: (..., 3, 4) camera-to-model, OpenGL's axes.
-            intrinsics: (..., 3, 3) pixels.
-            width, height: pixels, an int or (...).
-        """
-        poses = poses.double()
-        rotation, shift = self._parts(poses)
-        turned = rotation.mT @ (poses[..., :3] * poses.new_tensor([1.0, -1.0, -1.0]))
-        centre = (poses[..., 3] / self.scale - shift) @ rotation
-        motion = torch.cat([turned, centre[..., None]], -1)
-        return Cameras.from_matrices(intrinsics.double(), motion, width=width, height=height)
-
     def _parts(self, like: Tensor) -> tuple[Tensor, Tensor]:
         transform = self.transform.to(like.device, torch.float64)
         return transform[:, :3], transform[:, 3]

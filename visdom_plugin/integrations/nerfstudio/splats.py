@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 
 import torch
 from gsplat.strategy.ops import remove
@@ -18,6 +17,7 @@ from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.configs import RegularizerConfig
+from visdom_plugin.hooks.protocols import Means
 from visdom_plugin.hull.domain import TRAINING_DOMAIN, VisibleDomain
 from visdom_plugin.integrations.nerfstudio.dataparser import host_cameras, told
 from visdom_plugin.integrations.nerfstudio.fields import known_views, rgba_mask_loss
@@ -102,7 +102,7 @@ class SplatfactoVd(SplatfactoModel):
 
     def prune_outside(self, step: int) -> None:
         """Removes Gaussians outside the hull, with their part of the optimisers and of the strategy's state."""
-        world = SimpleNamespace(means=self.frame.points_to_world(self.means.detach()))
+        world = Means(self.frame.points_to_world(self.means.detach()))
         outside = None if self.hook is None else self.hook.after_step(world, step)
         if outside is None or not bool(outside.any()) or bool(outside.all()):
             return
