@@ -58,7 +58,7 @@ def photometric_loss(rgb: Tensor, target: Tensor, ssim_weight: float, weight: Te
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(rgb, target)) / share
 
 
-_OPAQUE = 1 - 1e-6
+OPAQUE = 1 - 1e-6
 
 
 def below_one(alpha: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ def below_one(alpha: Tensor) -> Tensor:
     The bound keeps loss and gradient finite but lets the gradient through: a pixel beyond it is pulled down as
     one at the bound.
     """
-    return alpha - (alpha.detach() - _OPAQUE).clamp_min(0)
+    return alpha - (alpha.detach() - OPAQUE).clamp_min(0)
 
 
 def mask_loss(alpha: Tensor, mask: Tensor, weight: Tensor | None = None) -> Tensor:
@@ -79,7 +79,7 @@ def mask_loss(alpha: Tensor, mask: Tensor, weight: Tensor | None = None) -> Tens
         weight: (H, W) float, 0 at pixels that take no part and 1 elsewhere, or None when all do.
     """
     # Inside the mask nothing is gained beyond the upper bound. The lower one stops an unbounded gradient.
-    alpha = torch.where(mask < 1, below_one(alpha), alpha.clamp_max(_OPAQUE)).clamp_min(1e-6)
+    alpha = torch.where(mask < 1, below_one(alpha), alpha.clamp_max(OPAQUE)).clamp_min(1e-6)
     if weight is None:
         return torch.nn.functional.binary_cross_entropy(alpha, mask)
     total = torch.nn.functional.binary_cross_entropy(alpha, mask, weight, reduction="sum")

@@ -3,6 +3,8 @@ zero padding, images in [0, 1], as 3DGS has it."""
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -43,10 +45,16 @@ def _window() -> np.ndarray:
     return weights / weights.sum()
 
 
+@cache
+def _window_on(device: torch.device, dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):  # training may come after an evaluation that had it on
+        return torch.from_numpy(_window()).to(device, dtype)
+
+
 def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:
     """The same on any device."""
     x, y = (z.reshape(-1, *z.shape[-3:]).permute(0, 3, 1, 2).flatten(0, 1)[:, None] for z in (x, y))
-    window = torch.from_numpy(_window()).to(x)
+    window = _window_on(x.device, x.dtype)
     maps = torch.cat([x, y, x * x, y * y, x * y], 1).flatten(0, 1)[:, None]
     maps = torch.conv2d(maps, window.reshape(1, 1, TAPS, 1), padding=(RADIUS, 0))
     maps = torch.conv2d(maps, window.reshape(1, 1, 1, TAPS), padding=(0, RADIUS))

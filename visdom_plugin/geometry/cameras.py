@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -112,14 +113,23 @@ class Cameras:
             self.intrinsics[index], self.world_from_camera[index], self.width[index], self.height[index]
         )
 
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Width and height of one camera, shape (), as numbers; read from the device once."""
+        return int(self.width), int(self.height)
+
     def to(self, device=None, dtype: torch.dtype | None = None) -> Cameras:
         """The same cameras on another device or in another floating dtype."""
-        return Cameras(
+        moved = Cameras(
             self.intrinsics.to(device=device, dtype=dtype),
             self.world_from_camera.to(device=device, dtype=dtype),
             self.width.to(device=device),
             self.height.to(device=device),
         )
+        if not self.shape and (self.width.device.type == "cpu" or "size" in self.__dict__):
+            # What is drawn on a device asks for the size at every step, and reading it there waits.
+            moved.__dict__["size"] = self.size
+        return moved
 
     @property
     def centres(self) -> Tensor:
@@ -296,7 +306,7 @@ def rays_of(cameras: Cameras, uv_px: Tensor | None = None) -> Rays:
             raise ValueError(
                 "rays_of needs uv_px for a batch of cameras; index one camera for all its pixels"
             )
-        height, width = int(cameras.height), int(cameras.width)
+        width, height = cameras.size
         image_shape = (height, width, 3)
         rows = torch.arange(height, device=cameras.intrinsics.device, dtype=cameras.intrinsics.dtype) + 0.5
         columns = torch.arange(width, device=cameras.intrinsics.device, dtype=cameras.intrinsics.dtype) + 0.5

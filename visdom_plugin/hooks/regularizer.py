@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from torch import Generator, Tensor
+from torch.autograd.function import FunctionCtx, once_differentiable
 
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.camera_paths import interpolate
@@ -22,7 +23,7 @@ from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.point_colours import check_images, colour_points
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.hull.queries.shell_points import sample_shell
-from visdom_plugin.losses import below_one
+from visdom_plugin.losses import OPAQUE
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +42,23 @@ def outside_loss(alpha: Tensor, hull_mask: Tensor) -> Tensor:
     """
     if alpha.dtype in (torch.float16, torch.bfloat16):
         alpha = alpha.float()  # 1 - 1e-6 would round to 1
-    return torch.where(hull_mask, 0.0, -torch.log1p(-below_one(alpha))).mean()
+    return _Outside.apply(*torch.broadcast_tensors(alpha, hull_mask))
+
+
+class _Outside(torch.autograd.Function):
+    """The loss in a third of the kernels that its parts take; `losses.below_one` says what happens at 1."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, alpha: Tensor, hull_mask: Tensor) -> Tensor:
+        bounded = alpha.clamp_max(OPAQUE)
+        ctx.save_for_backward(bounded, hull_mask)
+        return torch.where(hull_mask, 0.0, -torch.log1p(-bounded)).mean()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None]:
+        bounded, hull_mask = ctx.saved_tensors
+        return torch.where(hull_mask, 0.0, slope / bounded.numel()) / (1 - bounded), None
 
 
 class Opacity(Protocol):
@@ -213,7 +230,7 @@ class VisDomGaussianRegularizer:
         losses = []
         for _ in range(self.config.views_per_step):
             camera, mask = self._draw(generator)
-            alpha = _opacity(render(camera.to(self._device)), mask.shape)
+            alpha = _opacity(render(camera), mask.shape)
             losses.append(outside_loss(alpha, mask.to(alpha.device)))
         return {"visdom_outside": self.config.weight / len(losses) * sum(losses[1:], losses[0])}
 
@@ -234,7 +251,7 @@ class VisDomGaussianRegularizer:
         """A view and the hull's silhouette in it, (H, W) bool."""
         if not self.config.bank:
             camera = self.sample_camera(generator)
-            return camera, depth_and_silhouette(self.hull, camera)[1]
+            return camera.to(self._device), depth_and_silhouette(self.hull, camera)[1]
         index = int(torch.randint(self.config.bank, (), generator=generator))
         if index not in self._bank:
             camera = self.sample_camera(torch.Generator().manual_seed(index))

@@ -185,11 +185,13 @@ class Hull:
             return self.contains(torch.as_tensor(np.asarray(points)), margin_voxels=margin_voxels).numpy()
         reach = int(np.ceil(margin_voxels))
         grid = self._grid_on(points.device, reach)
-        lower = torch.as_tensor(self.bounds[0] - reach * self.voxel_edges, device=points.device)
-        size = torch.tensor(grid.shape, device=points.device)
-        index = torch.floor(
-            (points.detach().double() - lower) / torch.as_tensor(self.voxel_edges, device=points.device)
-        )
+
+        def frame() -> tuple[Tensor, ...]:
+            values = self.bounds[0] - reach * self.voxel_edges, self.voxel_edges, np.array(grid.shape)
+            return tuple(torch.from_numpy(x).to(points.device) for x in values)
+
+        lower, edges, size = self._once(("frame around", str(points.device), reach), frame)
+        index = torch.floor((points.detach().double() - lower) / edges)
         inside = ((index >= 0) & (index < size)).all(-1)
         x, y, z = torch.where(inside[..., None], index, 0.0).long().unbind(-1)
         return inside & grid[x, y, z]

@@ -149,8 +149,7 @@ def draw_opacity(params: Params, camera: Cameras) -> Tensor:
         torch.zeros_like(means),
         camera.camera_from_world.to(means)[None],
         camera.intrinsics.to(means)[None],
-        int(camera.width),
-        int(camera.height),
+        *camera.size,
         packed=False,
     )
     return alphas[0, ..., 0]

@@ -24,7 +24,7 @@ def rasterise_gsplat(
             todo='pip install "visdom-plugin[cuda]", or use --device cpu',
         ) from error
     means = gaussians.means
-    width, height = int(camera.width), int(camera.height)
+    width, height = camera.size
     colours, alphas, meta = rasterization(
         means=means,
         quats=gaussians.quaternions,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from visdom_plugin.compute.transfer import send
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import pixel_radius, rays_of_pixels
 from visdom_plugin.scene import Views
@@ -26,13 +27,18 @@ class DataManager:
     def __init__(self, views: Views, seed: int, device: torch.device | str = "cpu"):
         self.seed, self.device = seed, torch.device(device)
         self._cameras = views.cameras.to(self.device)
+        # Views keep what they find out about themselves, such as their size as numbers.
+        self._each = [views.cameras[i].to(self.device) for i in range(len(views))]
         self._images = [image.to(self.device) for image in views.images]
         self._masks = [mask.to(self.device) for mask in views.masks]
         self._depths = [None if d is None else d.to(self.device) for d in views.mono_depths]
         ignored = [views.ignored(i) for i in range(len(views))]
         self._counted = [None if g is None or not bool(g.any()) else (~g).to(self.device) for g in ignored]
         self._mask_known = [views.mask_origin(i) not in ("colour", "missing") for i in range(len(views))]
-        self._ends = torch.tensor([mask.numel() for mask in self._masks]).cumsum(0)
+        ends = torch.tensor([0, *(mask.numel() for mask in self._masks)]).cumsum(0)
+        self._pixels = int(ends[-1])
+        self._starts, self._ends = ends[:-1].to(self.device), ends[1:].to(self.device)
+        self._known = None if all(self._mask_known) else torch.tensor(self._mask_known, device=self.device)
         self._drawable: Tensor | None = None
         self._flat: tuple[Tensor, Tensor] | None = None
 
@@ -54,7 +60,7 @@ class DataManager:
         counted = self._counted[index]
         return ViewBatch(
             index,
-            self._cameras[index],
+            self._each[index],
             self._images[index].float() / 255,
             self._masks[index].float(),
             self._depths[index] if self._depths else None,
@@ -71,18 +77,17 @@ class DataManager:
         rgb, mask = self._flat = self._flat or self._flatten()
         draw = generator(self.seed, "pixels", step)
         if self._drawable is None:
-            flat = torch.randint(int(self._ends[-1]), (n,), generator=draw)
+            flat = torch.randint(self._pixels, (n,), generator=draw)
         else:
             flat = self._drawable[torch.randint(len(self._drawable), (n,), generator=draw)]
+        flat = send(flat, self.device)
         view = torch.searchsorted(self._ends, flat, right=True)
-        inside = (flat - torch.cat([self._ends.new_zeros(1), self._ends])[view]).to(self.device)
-        flat, view = flat.to(self.device), view.to(self.device)
         return PixelBatch(
-            *rays_of_pixels(self._cameras, view, inside),
+            *rays_of_pixels(self._cameras, view, flat - self._starts[view]),
             rgb[flat].float() / 255,
             mask[flat].float(),
             pixel_radius(self._cameras[view]),
-            None if all(self._mask_known) else torch.tensor(self._mask_known, device=self.device)[view],
+            None if self._known is None else self._known[view],
             flat,
         )
 

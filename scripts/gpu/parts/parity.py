@@ -351,6 +351,9 @@ def _raster_case(count: int, size: int):
 
 def _first_step(name: str):
     def run(bench: Bench) -> dict:
+        from visdom_plugin import seeding
+
+        seeding.EVERYWHERE_ALIKE = True
         scene, found = subjects.built_in(bench.size(100, 40)), []
         changes = {"steps": 20}
         for device in (torch.device("cpu"), bench.device):

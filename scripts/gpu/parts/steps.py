@@ -27,7 +27,7 @@ class HookClock:
     def __init__(self, bench: Bench, hooks):
         self.bench, self.hook_s, self.drawing_s = bench, 0.0, 0.0
         for hook in hooks:
-            for name in ("bound", "after_step", "loss"):
+            for name in ("bound", "bound_pixels", "after_step", "loss"):
                 if hasattr(hook, name):
                     setattr(hook, name, self._around(getattr(hook, name), name))
 

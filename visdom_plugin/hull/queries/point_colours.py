@@ -90,7 +90,7 @@ def colour_points(hull: Hull, points: Tensor, cameras: Cameras, images: Sequence
     for view, image in enumerate(images):
         camera = cameras[view].to("cpu", torch.float64)
         uv, depth = project(camera, points)
-        width, height = int(camera.width), int(camera.height)
+        width, height = camera.size
         inside = (depth > 0) & (uv >= 0).all(-1) & (uv[:, 0] < width) & (uv[:, 1] < height)
         if not inside.any():
             continue

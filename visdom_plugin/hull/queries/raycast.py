@@ -296,11 +296,9 @@ def cast_with_torch(hull: Hull, origins: Tensor, directions: Tensor) -> Crossing
     """
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
     device = directions.device
-    lower, edges = (torch.as_tensor(x, device=device) for x in (hull.bounds[0].copy(), hull.voxel_edges))
+    lower, edges, low, high = hull._once(("frame", str(device)), lambda: _frame_on(hull, device))
     o = ((origins.detach().double() - lower) / edges).expand(*shape, 3).reshape(-1, 3)
     d = (directions.detach().double() / edges).expand(*shape, 3).reshape(-1, 3)
-    box = hull._once("box", lambda: occupied_box(hull.occupancy).astype(float))
-    low, high = torch.as_tensor(box, device=device)
     planes = torch.stack([(low - o) / d, (high - o) / d])
     within = (o >= low) & (o < high)
     planes = torch.where(d == 0, torch.where(within, torch.inf, torch.nan), planes)
@@ -314,6 +312,13 @@ def cast_with_torch(hull: Hull, origins: Tensor, directions: Tensor) -> Crossing
     last = torch.where(back >= 0, far - back, first)
     results = (torch.where(hit, first, 0.0), torch.where(hit, last, 0.0), hit)
     return Crossing(*(x.reshape(shape) for x in results))
+
+
+def _frame_on(hull: Hull, device: torch.device) -> tuple[Tensor, ...]:
+    """Lower corner, edges of a voxel, and the occupied voxels' first and last corner in units of voxels."""
+    box = occupied_box(hull.occupancy).astype(float)
+    values = np.stack([hull.bounds[0], hull.voxel_edges, *box])
+    return tuple(torch.from_numpy(values).to(device))
 
 
 def _march_ahead(hull: Hull, o: Tensor, d: Tensor, begin: Tensor, end: Tensor, alive: Tensor) -> Tensor:
@@ -367,7 +372,7 @@ def depth_and_silhouette(hull: Hull, camera: Cameras) -> tuple[Tensor, Tensor]:
         True where the ray through the pixel's centre meets the hull. On the camera's device.
     """
     K, motion = camera.intrinsics.double(), camera.world_from_camera.double()
-    height, width = int(camera.height), int(camera.width)
+    width, height = camera.size
     columns = torch.arange(width, dtype=torch.float64, device=K.device) + 0.5
     rows = torch.arange(height, dtype=torch.float64, device=K.device) + 0.5
     x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]

@@ -70,7 +70,7 @@ def bound_rays(
 
 def spread_rays(camera: Cameras, most: int = 256) -> tuple[Tensor, Tensor]:
     """Origins and directions (n, 3) of a camera's pixels, at most `most` evenly chosen along each side."""
-    height, width = int(camera.height), int(camera.width)
+    width, height = camera.size
     device = camera.intrinsics.device
     v, u = (
         torch.linspace(0.5, size - 0.5, min(size, most), dtype=torch.float64, device=device)

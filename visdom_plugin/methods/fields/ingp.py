@@ -36,7 +36,7 @@ from visdom_plugin.nerf.sampling.occupancy_grid import (
     select,
 )
 from visdom_plugin.scene import Views
-from visdom_plugin.seeding import generator
+from visdom_plugin.seeding import draw_on, generator, uniform
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
 HUBER_DELTA = 0.1  # Instant-NGP
@@ -90,7 +90,7 @@ class Ingp(RadianceField[IngpConfig]):
 
     def train_step(self, batch: PixelBatch, step: int) -> StepOutput:
         c = self.config
-        draw = generator(self.seed, "step", step)
+        draw = draw_on(self.device, generator(self.seed, "step", step))
         if step % c.occupancy_every == 0:
             fraction = 1.0 if step < c.occupancy_warm_up else c.occupancy_fraction
             self.occupancy.update(self._density, generator(self.seed, "occupancy", step), fraction=fraction)
@@ -98,7 +98,7 @@ class Ingp(RadianceField[IngpConfig]):
         background = self.draw_background(n, draw)
         rays = self._bound(batch.origins, batch.directions, self.hooks, batch.pixels)
         step_length = torch.where(rays.hit, c.step_length, c.missing_step_length)
-        shift = torch.rand(n, generator=draw).to(self.device)
+        shift = uniform(draw, self.device, n)
         samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks)
         rgb, alpha, _ = self._shade(rays, samples, background)
         target = photograph_on(background, batch, alpha)

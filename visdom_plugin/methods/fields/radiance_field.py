@@ -19,7 +19,7 @@ from visdom_plugin.nerf.frame import frame_of
 from visdom_plugin.nerf.optimiser import FieldOptimiser
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
-from visdom_plugin.seeding import generator
+from visdom_plugin.seeding import generator, uniform
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
 Config = TypeVar("Config", IngpConfig, ZipNerfConfig)
@@ -87,8 +87,9 @@ class RadianceField(ABC, Generic[Config]):
 
     def draw_background(self, n: int, generator: Generator) -> Tensor:
         """(n, 3) behind the photographs of a training step."""
-        random = self.config.background == "random"
-        return (torch.rand(n, 3, generator=generator) if random else torch.ones(n, 3)).to(self.device)
+        if self.config.background == "random":
+            return uniform(generator, self.device, n, 3)
+        return torch.ones(n, 3, device=self.device)
 
     def state_dict(self) -> dict[str, Tensor]:
         return self.optimiser.state_dict()

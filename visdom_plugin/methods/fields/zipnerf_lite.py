@@ -38,7 +38,7 @@ from visdom_plugin.nerf.sampling.contraction import contract
 from visdom_plugin.nerf.sampling.multisampling import multisample
 from visdom_plugin.nerf.sampling.ray_warp import curve_distances, distances_of
 from visdom_plugin.nerf.sampling.step_functions import anneal, sample_edges
-from visdom_plugin.seeding import generator
+from visdom_plugin.seeding import draw_on, generator, uniform
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
 CHARBONNIER = 0.001  # Zip-NeRF
@@ -130,7 +130,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
 
     def train_step(self, batch: PixelBatch, step: int) -> StepOutput:
         c = self.config
-        draw = generator(self.seed, "step", step)
+        draw = draw_on(self.device, generator(self.seed, "step", step))
         background = self.draw_background(len(batch.mask), draw)
         rays = self._bound(batch.origins, batch.directions, self.hooks, batch.pixels)
         progress = step / max(c.steps, 1)
@@ -210,10 +210,10 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
             s, weights = near.new_tensor([0.0, 1.0]).expand(n, 2).contiguous(), torch.ones_like(near)
         else:
             s, weights = before.s, before.weights.detach()
-        jitter = None if generator is None else torch.rand(n, 1, generator=generator).to(self.device)
+        jitter = None if generator is None else uniform(generator, self.device, n, 1)
         s = sample_edges(s, anneal(weights, progress, self.config.anneal_slope), count, jitter)
         t = distances_of(s, near, far)
-        turn = None if generator is None else torch.rand(n, count, generator=generator).to(self.device)
+        turn = None if generator is None else uniform(generator, self.device, n, count)
         points, std = multisample(rays.origins, rays.directions, t, radius, turn)
         out = self.model[name](points, std)
         density = truncated_exp(out[..., 0] + self.config.density_bias)

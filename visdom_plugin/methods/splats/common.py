@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Generator, Tensor
 
+from visdom_plugin.compute.transfer import send
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.losses import composite_target, mask_loss, photometric_loss
 from visdom_plugin.render import Render
@@ -54,8 +55,9 @@ def drop_some(gaussians: Gaussians, rate: float, generator: Generator) -> Gaussi
 
 def draw_background(config: GaussianSetConfig, generator: Generator, device: torch.device) -> Tensor:
     """(3,) the training background of a step."""
-    background = torch.rand(3, generator=generator) if config.background == "random" else torch.ones(3)
-    return background.to(device)
+    if config.background != "random":
+        return torch.ones(3, device=device)
+    return send(torch.rand(3, generator=generator), device)
 
 
 def scene_extent(cameras: Cameras) -> float:

@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
+from visdom_plugin.seeding import draw_on, uniform
 
 ROUNDING = -1e-3
 """In cells: rays that are cut to the cube end on its faces, and rounding puts their ends up to about 1e-4 outside.
@@ -68,15 +69,16 @@ class OccupancyGrid:
         """
         count = self.resolution**3
         device = self.density.device
+        draw = draw_on(device, generator)
         if fraction >= 1:
             cells = torch.arange(count, device=device)
         else:
             n = max(1, int(fraction * count))
-            cells = torch.randint(count, (n,), generator=generator).to(device)
+            cells = torch.randint(count, (n,), generator=draw, device=draw.device).to(device)
             occupied = self.occupied.flatten().nonzero()[:, 0]
             if len(occupied):
-                drawn = torch.randint(len(occupied), (n,), generator=generator).to(device)
-                cells = torch.cat([cells, occupied[drawn]])
+                drawn = torch.randint(len(occupied), (n,), generator=draw, device=draw.device)
+                cells = torch.cat([cells, occupied[drawn.to(device)]])
         index = torch.stack(
             [
                 cells // self.resolution**2,
@@ -85,13 +87,13 @@ class OccupancyGrid:
             ],
             -1,
         )
-        within = torch.rand(len(cells), 3, generator=generator).to(device)
+        within = uniform(draw, device, len(cells), 3)
         points = ((index + within) * (2 / self.resolution) - 1) * self.half_side
         found = density_of(points).float()
         self.density *= self.decay
         # The same cell may be drawn twice: the larger density counts, whatever the order.
         self.density.scatter_reduce_(0, cells, found, "amax")
-        limit = min(self.threshold, float(self.density.double().mean()))
+        limit = self.density.double().mean().clamp_max(self.threshold)
         self.occupied = (self.density > limit).reshape(self.occupied.shape) & self.reachable
 
     def restrict(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> None:

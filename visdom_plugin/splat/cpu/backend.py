@@ -26,7 +26,7 @@ def rasterise_cpu(
     gaussians: Gaussians, camera: Cameras, background: Tensor, degree: int, near: float
 ) -> Render:
     """See `rasterise`. float32 or float64, by the dtype of the means."""
-    width, height = int(camera.width), int(camera.height)
+    width, height = camera.size
     packed = _pack(camera, near).to(gaussians.means.dtype).numpy()
     parameters = gaussians.tensors().values()
     means2d, splats, extents, radii = _Project.apply(*parameters, degree, packed, width, height)
