@@ -17,7 +17,7 @@ from visdom_plugin.hooks.regularizer import VisDomGaussianRegularizer
 from visdom_plugin.hooks.sampler import VisDomSampler
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.queries.raycast import Crossing
-from visdom_plugin.methods.splats import gs_go as method
+from visdom_plugin.methods.splats.gs_go import GsGo
 from visdom_plugin.render import Render
 from visdom_plugin.training.batches import DataManager
 
@@ -48,21 +48,13 @@ def hull(scene):
     return VisibleDomain(resolution=32).carve(*scene.train.silhouettes())
 
 
-def draw_on_meta(gaussians, camera, background, *, sh_degree):
-    """A picture that depends on all it is made of, for a camera whose size is asked as a rasteriser asks it."""
+def draw_on_meta(gaussians, camera, background, **_):
+    """A picture that depends on all it is made of; the camera's size is asked as a rasteriser asks it."""
     width, height = camera.size
-    weight = (
-        gaussians.means.sum()
-        + gaussians.opacity_logits.sum()
-        + camera.camera_from_world.to(weight_of(gaussians)).sum()
-    )
-    rgb = background * weight.expand(height, width, 3)
-    info = {"width": width, "height": height}
-    return Render(rgb, weight.sigmoid().expand(height, width), weight.expand(height, width), info)
-
-
-def weight_of(gaussians):
-    return gaussians.means
+    motion = camera.camera_from_world.to(gaussians.means)
+    value = gaussians.means.sum() + gaussians.opacity_logits.sum() + motion.sum()
+    alpha = value.sigmoid().expand(height, width)
+    return Render(background * alpha[..., None], alpha, value.expand(height, width))
 
 
 def test_what_would_wait_is_seen():
@@ -75,13 +67,13 @@ def test_what_would_wait_is_seen():
 
 
 def test_a_splat_step_waits_for_nothing(scene, hull, monkeypatch):
-    monkeypatch.setattr(method, "rasterise", draw_on_meta)
-    monkeypatch.setattr(method, "load_kernels", lambda device: None)
+    monkeypatch.setattr("visdom_plugin.splat.model.rasterise", draw_on_meta)
+    monkeypatch.setattr("visdom_plugin.methods.splats.splat_method.refuse_unseen", lambda *_: None)
     views = scene.train
     hook = VisDomGaussianRegularizer(hull, views.cameras.to("cpu"), bank=2)
     hook._device = META
     config = replace(gs_go.SPEC.quick, initial_points=50, hull=None, mask_weight=0.1)
-    splats = method.GsGo(config)
+    splats = GsGo(config)
     splats.setup(views, [], hull=hull, device=META, seed=0)
     splats.hooks = [hook]
     batches = DataManager(views, 0, device=META)

@@ -126,10 +126,13 @@ class Cameras:
             self.width.to(device=device),
             self.height.to(device=device),
         )
+        return self._hand_size(moved)
+
+    def _hand_size(self, other: Cameras) -> Cameras:
+        """`other`, which has the same size and need not read it from the device again."""
         if not self.shape and (self.width.device.type == "cpu" or "size" in self.__dict__):
-            # What is drawn on a device asks for the size at every step, and reading it there waits.
-            moved.__dict__["size"] = self.size
-        return moved
+            other.__dict__["size"] = self.size
+        return other
 
     @property
     def centres(self) -> Tensor:
@@ -152,13 +155,13 @@ class Cameras:
         """The same cameras in the frame that has its origin at `origin` (3,) float64, with the same axes."""
         motion = self.world_from_camera.clone()
         motion[..., :3, 3] = (self.centres.double() - origin.to(motion.device)).to(motion)
-        return Cameras(self.intrinsics, motion, self.width, self.height)
+        return self._hand_size(Cameras(self.intrinsics, motion, self.width, self.height))
 
     def in_units(self, length: float) -> Cameras:
         """The same cameras with positions counted in lengths of that many scene units."""
         motion = self.world_from_camera.clone()
         motion[..., :3, 3] = (self.centres.double() / length).to(motion)
-        return Cameras(self.intrinsics, motion, self.width, self.height)
+        return self._hand_size(Cameras(self.intrinsics, motion, self.width, self.height))
 
     def resized(self, width, height) -> Cameras:
         """Cameras whose images were resampled to another size, each axis by its own ratio."""
