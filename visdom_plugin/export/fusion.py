@@ -14,6 +14,7 @@ import torch
 
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
+from visdom_plugin.export.meshes import Mesh
 from visdom_plugin.geometry.camera_paths import look_at_camera
 from visdom_plugin.geometry.cameras import Cameras
 
@@ -22,9 +23,13 @@ if TYPE_CHECKING:
 
     from visdom_plugin.training.evaluate import Renderer
 
-BEHIND = 0.2
+RESOLUTION, VIEWS, PICTURE_PX = 160, 32, 200
+"""Voxels along the longest side; pictures taken all round, and their width and height."""
 TRUNCATION = 3.0
 """Voxels in front of and behind a surface over which its distance is kept."""
+BEHIND = 0.1
+"""Weight of a view that has something in front of a voxel. Without it, one view that sees through a gap in a
+surface digs a hole into what all others find solid."""
 
 
 def surround(cameras: Cameras, centre: Tensor, count: int, size_px: int) -> Cameras:
@@ -48,11 +53,12 @@ def surround(cameras: Cameras, centre: Tensor, count: int, size_px: int) -> Came
     flat = (1 - z * z).sqrt()
     at = centre + distance * torch.stack([flat * angle.cos(), flat * angle.sin(), z], -1)
     motion = look_at_camera(at, centre.expand_as(at), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-    narrow = torch.minimum(cameras.width / cameras.intrinsics[:, 0, 0], cameras.height / cameras.intrinsics[:, 1, 1])
+    size = torch.stack([cameras.width, cameras.height], -1)
+    narrow = (size / cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[:, :2]).amin(-1)
     focal = size_px / float(narrow.mean())
     K = torch.tensor([[focal, 0, size_px / 2], [0, focal, size_px / 2], [0, 0, 1]], dtype=torch.float64)
-    size = torch.full((count,), size_px)
-    return Cameras(K.expand(count, 3, 3), motion, size, size)
+    side = torch.full((count,), size_px)
+    return Cameras(K.expand(count, 3, 3), motion, side, side)
 
 
 @kernel()
@@ -71,6 +77,7 @@ def _integrate(
         view: (3, 4) camera from world; K: (3, 3).
         depth, alpha, rgb: (H, W), (H, W), (H, W, 3) float32.
         truncation: scene units.
+        behind: see `BEHIND`.
     """
     nx, ny, nz = total.shape
     height, width = depth.shape
@@ -153,13 +160,10 @@ class Volume:
             *(np.ascontiguousarray(a, np.float32) for a in (depth, alpha, rgb)), TRUNCATION * self.edge, BEHIND,
         )  # fmt: skip
 
-    def surface(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """The zero level by marching cubes.
+    def surface(self) -> Mesh | None:
+        """The zero level by marching cubes; None where there is none.
 
         Voxels that every view has something in front of are inside.
-
-        Returns:
-            vertices (V, 3) float64, faces (F, 3) int64 outward, rgb (V, 3) uint8; None where there is no surface.
         """
         from scipy.ndimage import distance_transform_edt, map_coordinates
         from skimage.measure import marching_cubes
@@ -173,28 +177,38 @@ class Volume:
         colour = self._colour / np.maximum(self._near, 1e-9)[..., None]
         nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
         colour = colour[tuple(nearest)]
-        rgb = np.stack([map_coordinates(colour[..., c], vertices.T, order=1, mode="nearest") for c in range(3)], -1)
+        rgb = np.stack(
+            [map_coordinates(colour[..., c], vertices.T, order=1, mode="nearest") for c in range(3)], -1
+        )
         world = self.lower + self.edge * (vertices + 0.5)
-        return world, faces.astype(np.int64), (rgb.clip(0, 1) * 255).round().astype(np.uint8)
+        return Mesh(world, faces.astype(np.int64), (rgb.clip(0, 1) * 255).round().astype(np.uint8))
 
 
 def fuse(
-    renderer: Renderer, cameras: Cameras, bounds: np.ndarray, *, resolution: int = 160,
-    inside: Callable[[Tensor], Tensor] | None = None, device: torch.device | str = "cpu",
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:  # fmt: skip
+    renderer: Renderer,
+    cameras: Cameras,
+    bounds: np.ndarray,
+    *,
+    resolution: int = RESOLUTION,
+    inside: Callable[[Tensor], Tensor] | None = None,
+    device: torch.device | str = "cpu",
+) -> Mesh | None:
     """The surface of what a renderer draws, see `Volume`.
+
+    It is looked at from the capture's cameras and from `VIEWS` more that surround it.
 
     Args:
         renderer: a trained method, or Gaussians.
-        cameras: (N,) cameras to look from, world frame.
+        cameras: (N,) cameras of the capture, world frame.
         bounds: (2, 3) box around the object, world frame.
     """
     volume = Volume(bounds, resolution, inside)
+    around = surround(cameras, torch.as_tensor(np.asarray(bounds).mean(0)), VIEWS, PICTURE_PX)
     black = torch.zeros(3, device=device)
-    for i in range(len(cameras)):
+    for camera in (*(cameras[i] for i in range(len(cameras))), *(around[i] for i in range(VIEWS))):
         with torch.no_grad():
-            render = renderer.render(cameras[i].to(device), black)
+            render = renderer.render(camera.to(device), black)
         alpha = render.alpha.float().cpu().numpy()
         rgb = render.rgb.float().cpu().numpy() / np.maximum(alpha, 1e-3)[..., None]
-        volume.add(cameras[i], render.depth.float().cpu().numpy(), alpha, rgb)
+        volume.add(camera, render.depth.float().cpu().numpy(), alpha, rgb)
     return volume.surface()

@@ -40,10 +40,11 @@ def to_bytes(image: Tensor) -> np.ndarray:
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Writes (H, W, 3) RGB or (H, W) grey, uint8, in one step."""
+    """Writes (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) grey, uint8, in one step."""
     import cv2
 
-    ok, data = cv2.imencode(".png", image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
+    order = {2: ..., 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[-1] if image.ndim == 3 else 2]
+    ok, data = cv2.imencode(".png", np.ascontiguousarray(image if image.ndim == 2 else image[..., order]))
     if not ok:
         raise OSError(f"OpenCV could not encode {path}")
     write_bytes(path, data.tobytes())

@@ -62,6 +62,16 @@ def look_at_camera(centre: Tensor, target: Tensor, up: Tensor) -> Tensor:
     return torch.cat([top, top.new_tensor([0.0, 0, 0, 1]).expand(*top.shape[:-2], 1, 4)], -2)
 
 
+def capture_up(cameras: Cameras) -> Tensor:
+    """(3,) unit: which way is up for cameras (N,), the mean of theirs.
+
+    Turntables and rings share it; a capture without one (views from above and below) gets z.
+    """
+    mean_up = -cameras.world_from_camera[:, :3, 1].mean(0)
+    up = mean_up if mean_up.norm() > 0.3 else mean_up.new_tensor([0.0, 0.0, 1.0])
+    return up / up.norm()
+
+
 def orbit(cameras: Cameras, count: int, look_at: Tensor | None = None) -> Cameras:
     """A full circle around the object at the capture's mean distance and height.
 
@@ -76,10 +86,7 @@ def orbit(cameras: Cameras, count: int, look_at: Tensor | None = None) -> Camera
     target = look_at_point(cameras) if look_at is None else look_at.to(cameras.world_from_camera)
     offsets = cameras.centres - target
     distance = offsets.norm(dim=-1).mean()
-    # Turntables and rings share their mean up; a capture without one (views from above and below) gets z.
-    mean_up = -cameras.world_from_camera[:, :3, 1].mean(0)
-    up = mean_up if mean_up.norm() > 0.3 else mean_up.new_tensor([0.0, 0.0, 1.0])
-    up = up / up.norm()
+    up = capture_up(cameras)
     sine = (torch.nn.functional.normalize(offsets, dim=-1) @ up).mean().clamp(-0.95, 0.95)
     first = offsets[0] - (offsets[0] @ up) * up
     if first.norm() < 1e-6 * distance:

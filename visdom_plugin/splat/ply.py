@@ -21,6 +21,8 @@ _TYPES = {
     "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4",
     "uint32": "<u4", "float32": "<f4", "float64": "<f8",
 }  # fmt: skip
+COMMENTS = ("comment Exported by visdom-plugin", "comment SplatRenderMode: default")
+"""Viewers read the second: the Gaussians were fitted without the anti-aliasing filter of mip-splatting."""
 _REST_OF_DEGREE = (0, 9, 24, 45)
 _MAX_HEADER_BYTES = 1 << 16
 
@@ -43,7 +45,7 @@ def write_gaussians(path: str | Path, gaussians: Gaussians, origin: Tensor | Non
     table = np.empty(n, [("xyz", _TYPES[places], 3), ("rest", "<f4", len(names) - 3)])
     table["xyz"] = arrays["means"] if far is None else gaussians.means.detach().cpu().double() + far
     table["rest"] = np.concatenate(columns, 1)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    header = ["ply", "format binary_little_endian 1.0", *COMMENTS, f"element vertex {n}"]
     header += [f"property {places} {name}" for name in names[:3]]
     header += [f"property float {name}" for name in names[3:]] + ["end_header", ""]
     write_bytes(Path(path), "\n".join(header).encode("ascii") + table.tobytes())

@@ -1,0 +1,182 @@
+"""Files of Gaussians by their suffix: .ply, .spz and .splat written and read, .sog and .html by splat-transform."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visdom_plugin.atomic_files import appearing, write_bytes
+from visdom_plugin.errors import ConfigError, SceneError
+from visdom_plugin.export.spz import read_spz, write_spz
+from visdom_plugin.splat.gaussians import Gaussians
+from visdom_plugin.splat.ply import read_ply, write_gaussians
+from visdom_plugin.splat.spherical_harmonics import sh_from_rgb
+
+WRITTEN = ("ply", "spz", "splat", "sog", "html")
+READ = ("ply", "spz", "splat", "sog")
+_PACKAGE = "@playcanvas/splat-transform@2"
+_SPLAT = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+"""The records of a .splat file: scales and colours after activation, no harmonics, w x y z times 128 plus 128."""
+
+
+def write_splats(path: Path, gaussians: Gaussians, origin: Tensor | None = None) -> None:
+    """Writes Gaussians as the suffix of `path` says; the file appears whole or not at all.
+
+    Args:
+        origin: (3,) float64 of their frame in the frame the file shall have; None for the same frame.
+
+    Raises:
+        ConfigError: the format needs splat-transform, which is not there or fails.
+    """
+    kind = path.suffix.lower().removeprefix(".")
+    if kind == "ply":
+        write_gaussians(path, gaussians, origin)
+    elif kind == "spz":
+        write_spz(path, gaussians, origin)
+    elif kind == "splat":
+        write_bytes(path, _splat_bytes(gaussians, origin))
+    else:
+        with tempfile.TemporaryDirectory() as folder, appearing(path) as part:
+            plain = Path(folder) / f"{path.stem}.ply"
+            # Single precision, which is all that the program reads: it is for who views, not for surveys.
+            moved = gaussians if origin is None else _shift(gaussians, origin)
+            write_gaussians(plain, moved)
+            splat_transform(plain, part, asked=path)
+
+
+def read_splats(path: Path, origin: Tensor | None = None) -> Gaussians:
+    """Reads a file of Gaussians, float32 on the CPU.
+
+    Args:
+        origin: (3,) float64; with it the means are relative to it.
+
+    Raises:
+        SceneError: for a file that is missing, damaged or of another kind.
+        ConfigError: for a .sog file where splat-transform is not there.
+    """
+    path = Path(path)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind == "ply":
+        return read_ply(path, origin)
+    if kind not in READ:
+        raise SceneError(
+            f"files of kind {path.suffix or '(no suffix)'} are not read",
+            where=path,
+            todo=f"give one of {', '.join('.' + k for k in READ)}",
+        )
+    if not path.is_file():
+        raise SceneError("there is no such file", where=path)
+    if kind == "sog":
+        with tempfile.TemporaryDirectory() as folder:
+            splat_transform(path, Path(folder) / "plain.ply", asked=Path(folder) / "plain.ply")
+            return read_ply(Path(folder) / "plain.ply", origin)
+    found = read_spz(path) if kind == "spz" else _parse_splat(path)
+    return found if origin is None else _shift(found, -origin)
+
+
+def splat_transform(source: Path, target: Path, *, asked: Path) -> None:
+    """Converts by PlayCanvas' splat-transform, which runs on Node.
+
+    Args:
+        asked: the file that the user wants, for the command in an error.
+
+    Raises:
+        ConfigError: Node is not there, or the program fails.
+    """
+    line = f"npx {_PACKAGE} -g cpu FILE.ply {asked.name}"
+    if found := shutil.which("splat-transform"):
+        words = [found]
+    elif found := shutil.which("npx"):
+        words = [found, "--yes", _PACKAGE]
+    else:
+        raise ConfigError(
+            f"a {asked.suffix} file is made by splat-transform, which needs Node.js, and there is none",
+            where=asked,
+            todo=f"install Node.js 18 or later; or export a .ply and run, where there is one: {line}",
+        )
+    done = subprocess.run(
+        [*words, "-q", "-w", "-g", "cpu", source, target], capture_output=True, text=True, check=False
+    )
+    if done.returncode or not target.exists():
+        said = (done.stderr or done.stdout).strip().splitlines()
+        raise ConfigError(
+            f"splat-transform failed: {said[-1] if said else f'status {done.returncode}'}",
+            where=asked,
+            cause="no network to fetch it with npx" if "npx" in words[0] else None,
+            todo=f"npm install --global {_PACKAGE}, or export a .ply and run where it works: {line}",
+        )
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """What a file of Gaussians holds: numbers, ranges, comments.
+
+    Raises:
+        SceneError, ConfigError: as `read_splats`.
+    """
+    found = read_splats(path)
+    n = len(found)
+    about: dict[str, Any] = {"file": str(path), "bytes": path.stat().st_size, "gaussians": n}
+    about["degree"] = found.degree
+    if path.suffix.lower() == ".ply":
+        head = path.read_bytes()[: 1 << 16].partition(b"end_header")[0].decode("ascii", "replace")
+        about["comments"] = [x.removeprefix("comment ") for x in head.splitlines() if x.startswith("comment ")]
+    if n:
+        means, scales = found.means.double(), found.log_scales.double().exp()
+        opacity = found.opacity_logits.double().sigmoid()
+        lower, upper = (torch.quantile(means[:: max(1, n // 100_000)], q, 0) for q in (0.01, 0.99))
+        about |= {
+            "bounds": [means.amin(0).tolist(), means.amax(0).tolist()],
+            "bounds_98_percent": [lower.tolist(), upper.tolist()],
+            "scale_median": float(scales.median()),
+            "scale_largest": float(scales.max()),
+            "opacity_mean": float(opacity.mean()),
+            "nearly_transparent": float((opacity < 1 / 255).double().mean()),
+            "not_finite": int(sum((~torch.isfinite(v)).any() for v in found.tensors().values())),
+        }
+    return about
+
+
+def _shift(gaussians: Gaussians, by: Tensor) -> Gaussians:
+    values = gaussians.tensors()
+    return Gaussians(**values | {"means": (gaussians.means.detach().cpu().double() + by).float()})
+
+
+def _splat_bytes(gaussians: Gaussians, origin: Tensor | None) -> bytes:
+    g = gaussians.detach().to("cpu", torch.float64)
+    # Viewers of this format draw as they come: the largest and most opaque first.
+    order = torch.argsort(g.log_scales.sum(1).exp() * g.opacity_logits.sigmoid(), descending=True)
+    table = np.empty(len(g), _SPLAT)
+    table["xyz"] = (g.means if origin is None else g.means + origin)[order]
+    table["scale"] = g.log_scales.exp()[order]
+    rgb = 0.5 + g.sh[:, 0] / float(sh_from_rgb(torch.tensor(1.5)))
+    rgba = torch.cat([rgb, g.opacity_logits.sigmoid()[:, None]], 1)
+    table["rgba"] = (rgba[order] * 255).round().clamp(0, 255)
+    turn = torch.nn.functional.normalize(g.quaternions, dim=-1)
+    table["rotation"] = (turn[order] * 128 + 128).round().clamp(0, 255)
+    return table.tobytes()
+
+
+def _parse_splat(path: Path) -> Gaussians:
+    data = path.read_bytes()
+    if not data or len(data) % _SPLAT.itemsize:
+        raise SceneError(
+            f"the file has {len(data)} bytes, which is no multiple of {_SPLAT.itemsize}",
+            where=path,
+            cause="a file that is cut off, or of another kind",
+        )
+    table = np.frombuffer(data, _SPLAT)
+    rgba = torch.from_numpy(table["rgba"].astype(np.float32)) / 255
+    return Gaussians(
+        torch.from_numpy(table["xyz"].copy()),
+        torch.from_numpy(np.log(np.maximum(table["scale"], 1e-12))),
+        (torch.from_numpy(table["rotation"].astype(np.float32)) - 128) / 128,
+        rgba[:, 3].clamp(1e-4, 1 - 1e-4).logit(),
+        sh_from_rgb(rgba[:, None, :3]),
+    )
