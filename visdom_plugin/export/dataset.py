@@ -95,7 +95,9 @@ def _write_transforms(
                 "w": int(camera.width),
                 "h": int(camera.height),
                 # OpenGL's axes: y up, z back.
-                "transform_matrix": (camera.world_from_camera * torch.tensor([1.0, -1.0, -1.0, 1.0])).tolist(),
+                "transform_matrix": (
+                    camera.world_from_camera * torch.tensor([1.0, -1.0, -1.0, 1.0])
+                ).tolist(),
             }
         )
     content: dict[str, Any] = {"camera_model": "OPENCV", "frames": frames}

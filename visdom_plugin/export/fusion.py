@@ -79,7 +79,7 @@ def _integrate(
         truncation: scene units.
         behind: see `BEHIND`.
     """
-    nx, ny, nz = total.shape
+    _nx, ny, nz = total.shape
     height, width = depth.shape
     for i in range(begin, end):
         x = lower[0] + (i + 0.5) * edge
@@ -94,8 +94,8 @@ def _integrate(
                     continue
                 cx = view[0, 0] * x + view[0, 1] * y + view[0, 2] * z + view[0, 3]
                 cy = view[1, 0] * x + view[1, 1] * y + view[1, 2] * z + view[1, 3]
-                u = int(math.floor(K[0, 0] * cx / cz + K[0, 2]))
-                v = int(math.floor(K[1, 1] * cy / cz + K[1, 2]))
+                u = math.floor(K[0, 0] * cx / cz + K[0, 2])
+                v = math.floor(K[1, 1] * cy / cz + K[1, 2])
                 if u < 0 or v < 0 or u >= width or v >= height:
                     continue
                 if alpha[v, u] < 0.5:
@@ -133,7 +133,9 @@ class Volume:
         shape = tuple(int(n) + 4 for n in np.ceil((bounds[1] - bounds[0]) / self.edge))
         self._total, self._weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self._colour, self._near = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
-        self.inside = np.ones(shape, bool) if inside is None else inside(self._centres()).numpy().reshape(shape)
+        self.inside = (
+            np.ones(shape, bool) if inside is None else inside(self._centres()).numpy().reshape(shape)
+        )
 
     def _centres(self) -> Tensor:
         axes = [
@@ -172,7 +174,7 @@ class Volume:
         distance = np.where(self.inside, distance, 1)
         if not (distance < 0).any():
             return None
-        vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="ascent")
+        vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
         seen = self._near > 0
         colour = self._colour / np.maximum(self._near, 1e-9)[..., None]
         nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)

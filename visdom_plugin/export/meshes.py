@@ -35,9 +35,7 @@ def keep_faces(mesh: Mesh, kept: np.ndarray) -> Mesh:
     """
     faces = mesh.faces[kept]
     used, index = np.unique(faces, return_inverse=True)
-    return Mesh(
-        mesh.vertices[used], index.reshape(-1, 3), None if mesh.rgb is None else mesh.rgb[used]
-    )
+    return Mesh(mesh.vertices[used], index.reshape(-1, 3), None if mesh.rgb is None else mesh.rgb[used])
 
 
 def largest_pieces(mesh: Mesh, share: float) -> Mesh:
@@ -127,9 +125,7 @@ def mesh_glb(mesh: Mesh) -> bytes:
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "translation": middle.tolist()}],
-        "meshes": [
-            {"primitives": [{"attributes": attributes, "indices": len(blocks) - 1, "material": 0}]}
-        ],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": len(blocks) - 1, "material": 0}]}],
         "materials": [
             {"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "extensions": {unlit: {}}}
         ],
@@ -141,5 +137,11 @@ def mesh_glb(mesh: Mesh) -> bytes:
     text += b" " * (-len(text) % 4)
     head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
     return b"".join(
-        [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary]
+        [
+            head,
+            struct.pack("<I4s", len(text), b"JSON"),
+            text,
+            struct.pack("<I4s", len(binary), b"BIN\0"),
+            binary,
+        ]
     )

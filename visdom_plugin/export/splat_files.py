@@ -1,4 +1,4 @@
-"""Files of Gaussians by their suffix: .ply, .spz and .splat written and read, .sog and .html by splat-transform."""
+"""Files of Gaussians by their suffix: .ply, .spz and .splat written and read, .sog, .html by splat-transform."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from torch import Tensor
 from visdom_plugin.atomic_files import appearing, write_bytes
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.export.spz import read_spz, write_spz
+from visdom_plugin.geometry.harmonics import C0
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.ply import read_ply, write_gaussians
 from visdom_plugin.splat.spherical_harmonics import sh_from_rgb
@@ -126,7 +127,9 @@ def describe(path: Path) -> dict[str, Any]:
     about["degree"] = found.degree
     if path.suffix.lower() == ".ply":
         head = path.read_bytes()[: 1 << 16].partition(b"end_header")[0].decode("ascii", "replace")
-        about["comments"] = [x.removeprefix("comment ") for x in head.splitlines() if x.startswith("comment ")]
+        about["comments"] = [
+            x.removeprefix("comment ") for x in head.splitlines() if x.startswith("comment ")
+        ]
     if n:
         means, scales = found.means.double(), found.log_scales.double().exp()
         opacity = found.opacity_logits.double().sigmoid()
@@ -155,7 +158,7 @@ def _splat_bytes(gaussians: Gaussians, origin: Tensor | None) -> bytes:
     table = np.empty(len(g), _SPLAT)
     table["xyz"] = (g.means if origin is None else g.means + origin)[order]
     table["scale"] = g.log_scales.exp()[order]
-    rgb = 0.5 + g.sh[:, 0] / float(sh_from_rgb(torch.tensor(1.5)))
+    rgb = 0.5 + C0 * g.sh[:, 0]
     rgba = torch.cat([rgb, g.opacity_logits.sigmoid()[:, None]], 1)
     table["rgba"] = (rgba[order] * 255).round().clamp(0, 255)
     turn = torch.nn.functional.normalize(g.quaternions, dim=-1)

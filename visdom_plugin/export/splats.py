@@ -24,7 +24,7 @@ def crop(gaussians: Gaussians, inside: Callable[[Tensor], Tensor]) -> Gaussians:
 
 
 def move(gaussians: Gaussians, motion: Tensor) -> Gaussians:
-    """The Gaussians moved by a rigid motion (4, 4) float64; they look the same to a camera that moves with them."""
+    """The Gaussians moved by a rigid motion (4, 4) float64; a camera that moves with them sees the same."""
     rotation = motion[:3, :3].double()
     turned = rotation @ matrix_from_quaternion(gaussians.quaternions.double())
     return Gaussians(
@@ -32,7 +32,9 @@ def move(gaussians: Gaussians, motion: Tensor) -> Gaussians:
         gaussians.log_scales,
         quaternion_from_matrix(turned).float(),
         gaussians.opacity_logits,
-        torch.einsum("ab,nbc->nac", turn_harmonics(rotation, gaussians.degree), gaussians.sh.double()).float(),
+        torch.einsum(
+            "ab,nbc->nac", turn_harmonics(rotation, gaussians.degree), gaussians.sh.double()
+        ).float(),
     )
 
 

@@ -8,6 +8,7 @@ y up, z back, those of a PLY file x right, y down, z ahead: everything is turned
 from __future__ import annotations
 
 import gzip
+import itertools
 import math
 import struct
 import zlib
@@ -81,9 +82,11 @@ def read_spz(path: Path) -> Gaussians:
         if magic != _MAGIC or version not in (2, 3) or degree > 3 or len(data) < _HEADER.size + sum(sizes):
             raise ValueError("its header is of another kind, or it is cut off")
     except (OSError, EOFError, ValueError, struct.error, zlib.error) as error:
-        raise SceneError(f"this is no SPZ file that can be read: {error}", where=path, todo=convert) from error
+        raise SceneError(
+            f"this is no SPZ file that can be read: {error}", where=path, todo=convert
+        ) from error
     ends = np.cumsum([_HEADER.size, *sizes])
-    parts = [np.frombuffer(data, np.uint8, b - a, a) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    parts = [np.frombuffer(data, np.uint8, b - a, a) for a, b in itertools.pairwise(ends)]
     places = np.zeros((n, 3, 4), np.uint8)
     places[..., 1:] = parts[0].reshape(n, 3, 3)
     # The three bytes stand above an empty one, so that the sign comes along.

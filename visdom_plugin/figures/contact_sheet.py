@@ -43,8 +43,9 @@ def write_png(path: Path, image: np.ndarray) -> None:
     """Writes (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) grey, uint8, in one step."""
     import cv2
 
-    order = {2: ..., 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[-1] if image.ndim == 3 else 2]
-    ok, data = cv2.imencode(".png", np.ascontiguousarray(image if image.ndim == 2 else image[..., order]))
+    if image.ndim == 3:
+        image = image[..., [2, 1, 0, 3][: image.shape[2]]]
+    ok, data = cv2.imencode(".png", np.ascontiguousarray(image))
     if not ok:
         raise OSError(f"OpenCV could not encode {path}")
     write_bytes(path, data.tobytes())

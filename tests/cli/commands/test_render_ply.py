@@ -6,6 +6,7 @@ import torch
 
 from datamodules import load
 from tests.splat.twin import make_gaussians
+from visdom_plugin.cli import subject
 from visdom_plugin.cli.commands import render
 from visdom_plugin.figures.contact_sheet import read_png, to_bytes
 from visdom_plugin.geometry.local_frame import local_origin
@@ -44,7 +45,7 @@ def test_a_cloud_far_from_the_origin_looks_the_same(cloud, far):
     write_gaussians(cloud, near, shift)
     moved = cameras.relative_to(-shift)
     origin = local_origin(moved)
-    there = render.PointCloud(read_ply(cloud, origin), origin, near=0.01)
+    there = subject.PointCloud(read_ply(cloud, origin), origin, near=0.01)
     white = torch.ones(3)
     for i in range(len(cameras)):
         drawn, wanted = there.render(moved[i], white), rasterise(near, cameras[i], white)

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from visdom_plugin.cli import entry
-from visdom_plugin.cli.options import Device, SceneOptions, read_options, resolve_device
+from visdom_plugin.cli.options import Device, SceneOptions
+from visdom_plugin.cli.subject import is_splat_file, open_subject
 from visdom_plugin.errors import ConfigError
 
 if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
-
     from visdom_plugin.geometry.cameras import Cameras
     from visdom_plugin.hull.hull import Hull
-    from visdom_plugin.render import Render
     from visdom_plugin.scene import Scene
-    from visdom_plugin.splat.gaussians import Gaussians
-    from visdom_plugin.training.evaluate import Renderer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +30,7 @@ class Options(SceneOptions):
     """
 
     run: tyro.conf.Positional[Path]
-    """Run directory, as visdom-train names it, or a .ply file of Gaussians."""
+    """Run directory, as visdom-train names it, or a .ply, .spz, .splat or .sog file of Gaussians."""
     path: Literal["orbit", "between", "train", "test"] = "orbit"
     """orbit: a circle round the object; between: from training view to training view; train, test: these views."""
     frames: int = 60
@@ -51,11 +46,6 @@ class Options(SceneOptions):
     """Folder of the scene. A run knows its own: say where it is if it has moved."""
     device: Device = "auto"
     """Where to compute."""
-
-    @property
-    def is_ply(self) -> bool:
-        """Whether a point cloud is to be drawn."""
-        return self.run.suffix.lower() == ".ply" and not self.run.is_dir()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -80,8 +70,8 @@ def _render(argv: Sequence[str]) -> None:
     from visdom_plugin.figures.contact_sheet import to_bytes, write_png, write_video
     from visdom_plugin.training.evaluate import render_on_white
 
-    scene, method, hull, device = (open_point_cloud if options.is_ply else open_trained)(options)
-    cameras = cameras_along(options.path, options.frames, scene, hull)
+    subject = open_subject(options.run, options, options.device, test=options.path == "test")
+    cameras = cameras_along(options.path, options.frames, subject.scene, subject.hull)
     target = options.out or default_target(options)
     if options.format == "png":
         clear_numbered(target, len(cameras), ours=options.out is None)
@@ -93,7 +83,7 @@ def _render(argv: Sequence[str]) -> None:
         )
     frames = []
     for i in range(len(cameras)):
-        picture = to_bytes(render_on_white(method, cameras[i], device)[0])
+        picture = to_bytes(render_on_white(subject.renderer, cameras[i], subject.device)[0])
         if options.format == "png":
             write_png(target / f"{i:04d}.png", picture)
         else:
@@ -106,84 +96,10 @@ def _render(argv: Sequence[str]) -> None:
         sys.stdout.write(f"{target}\n")
 
 
-Subject = tuple["Scene", "Renderer", "Hull | None", "torch.device"]
-"""What is drawn: the scene with the cameras, what renders, its hull, where."""
-
-
-def open_trained(options: Options) -> Subject:
-    """A run's state, with the scene it was trained on.
-
-    Raises:
-        ConfigError: an option says how to read a scene, which run.json says already.
-    """
-    from visdom_plugin.cli.runs import open_run
-
-    for field in fields(SceneOptions):
-        if field.name not in ("data", "quiet") and getattr(options, field.name) != field.default:
-            raise ConfigError(
-                "a run's scene is read as it was for its training",
-                where=f"--{field.name.replace('_', '-')}",
-                todo="leave it out; it goes with a .ply file",
-            )
-    _, _, scene, method, hull, device, _ = open_run(
-        options.run, options.data, options.device, test=options.path == "test"
-    )
-    return scene, method, hull, device
-
-
-def open_point_cloud(options: Options) -> Subject:
-    """Gaussians from a file, with the scene whose cameras look at them; masks it need not have.
-
-    Raises:
-        SceneError: the file is no point cloud of Gaussians, or the scene cannot be read.
-    """
-    import torch
-
-    from visdom_plugin.cli.report import say
-    from visdom_plugin.cli.scenes import open_scene
-    from visdom_plugin.geometry.cameras import mean_distance
-    from visdom_plugin.geometry.local_frame import local_origin
-    from visdom_plugin.splat.ply import read_ply
-    from visdom_plugin.splat.rasterise import NEAR
-
-    device = torch.device(resolve_device(options.device))
-    reading = read_options(options) | {"missing_masks": "colour"}
-    scene = open_scene(options.data, **reading, fill=False, test=options.path == "test")
-    # Float32 holds them near the scene only, wherever the file's frame has its origin.
-    origin = local_origin(scene.train.cameras)
-    gaussians = read_ply(options.run, origin).to(device)
-    if not options.quiet:
-        whose = " (--data DIR names another scene)" if options.data is None else ""
-        say(f"{len(gaussians)} Gaussians seen by the cameras of {scene.name}{whose}")
-    return (
-        scene,
-        PointCloud(gaussians, origin, NEAR * float(mean_distance(scene.train.cameras))),
-        None,
-        device,
-    )
-
-
-@dataclass(frozen=True)
-class PointCloud:
-    """Gaussians that render as a trained method does."""
-
-    gaussians: Gaussians
-    origin: Tensor
-    """(3,) float64 of their frame, in the cameras' frame."""
-    near: float
-    """Where pictures begin, see `splat.rasterise`."""
-
-    def render(self, camera: Cameras, background: Tensor) -> Render:
-        """Their picture; `splat.rasterise` has the details."""
-        from visdom_plugin.splat.rasterise import rasterise
-
-        return rasterise(self.gaussians, camera.relative_to(self.origin), background, near=self.near)
-
-
 def default_target(options: Options) -> Path:
     """Where a path's pictures go by default; not into renders/test, which is the evaluation's."""
     name = f"{options.path}.mp4" if options.format == "mp4" else f"{options.path}_frames"
-    if options.is_ply:
+    if is_splat_file(options.run):
         return options.run.with_name(f"{options.run.stem}_{name}")
     return options.run / "renders" / name
 

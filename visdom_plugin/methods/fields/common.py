@@ -23,6 +23,21 @@ from visdom_plugin.training.protocols import PixelBatch
 log = logging.getLogger(__name__)
 
 
+MESH_RESOLUTION = 160
+"""Voxels along the longest side of what `mesh_density` looks at."""
+
+
+class FieldMesh(NamedTuple):
+    """A field's surface."""
+
+    vertices: np.ndarray
+    """(V, 3) float64."""
+    faces: np.ndarray
+    """(F, 3) int64, outward."""
+    rgb: np.ndarray
+    """(V, 3) uint8 as seen from outside along the normal."""
+
+
 class LocalRays(NamedTuple):
     """Rays in the field's frame, with the bounds of their samples."""
 
@@ -129,11 +144,12 @@ def mesh_density(
     frame: Frame,
     half_side: float,
     *,
-    resolution: int = 160,
+    resolution: int = MESH_RESOLUTION,
+    origin: Tensor | None = None,
     smallest_piece: float = 0.01,
     chunk: int = 1 << 17,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """The surface where the field is half opaque over a thirtieth of the object, by marching cubes, world frame.
+) -> FieldMesh | None:
+    """The surface where the field is half opaque over a thirtieth of the object, by marching cubes.
 
     Whatever the resolution, the level is the same. A coarse look at the whole cube finds the object's box.
 
@@ -142,11 +158,11 @@ def mesh_density(
         colour_of: points and viewing directions (m, 3) to rgb (m, 3) in [0, 1].
         half_side: of the cube around the frame's origin.
         resolution: voxels along the longest side of the box.
+        origin: (3,) of the world frame in the capture's, see `Views.origin`; None for the same frame.
         smallest_piece: pieces with fewer voxels than this share of the largest one are left out.
 
     Returns:
-        vertices (V, 3) float64 world frame, faces (F, 3) int64 outward, and rgb (V, 3) uint8 as seen from
-        outside along the normal; None where nothing is opaque.
+        The mesh in the capture's frame; None where nothing is opaque.
     """
     from scipy.ndimage import label
     from skimage.measure import marching_cubes
@@ -194,16 +210,14 @@ def mesh_density(
             for i in range(0, len(points), chunk)
         ]
     rgb = (torch.cat(parts).clamp(0, 1) * 255).round().byte().numpy()
-    return frame.to_world(torch.from_numpy(local)).numpy(), faces.astype(np.int64), rgb
+    world = frame.to_world(torch.from_numpy(local)).numpy()
+    return FieldMesh(world if origin is None else world + origin.numpy(), faces.astype(np.int64), rgb)
 
 
-def export_mesh(
-    path: Path, mesh: tuple[np.ndarray, np.ndarray, np.ndarray] | None, origin: Tensor
-) -> list[Path]:
-    """Writes the mesh, moved by `origin` (3,), as PLY with vertex colours; warns where there is none."""
+def export_mesh(path: Path, mesh: FieldMesh | None) -> list[Path]:
+    """Writes the mesh as PLY with vertex colours; warns where there is none."""
     if mesh is None:
         log.warning("no mesh is exported: nowhere is the field half opaque")
         return []
-    vertices, faces, rgb = mesh
-    path.write_bytes(mesh_ply(vertices + origin.numpy(), faces, rgb))
+    path.write_bytes(mesh_ply(*mesh))
     return [path]

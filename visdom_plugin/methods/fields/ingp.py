@@ -12,6 +12,8 @@ from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.protocols import SamplerHook, sample_filters
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.fields.common import (
+    MESH_RESOLUTION,
+    FieldMesh,
     LocalRays,
     bound_rays,
     export_mesh,
@@ -138,6 +140,11 @@ class Ingp(RadianceField[IngpConfig]):
         self._rays = int(state["rays"])
 
     def export(self, folder: Path) -> list[Path]:
+        return export_mesh(Path(folder) / "mesh.ply", self.mesh())
+
+    def mesh(self, resolution: int = MESH_RESOLUTION) -> FieldMesh | None:
+        """The surface in the capture's frame; see `mesh_density`."""
+
         def density_of(points: Tensor) -> Tensor:
             # What rendering skips is not there.
             points = points.to(self.device)
@@ -146,8 +153,10 @@ class Ingp(RadianceField[IngpConfig]):
                 there &= hook.keep(self.frame.to_world(points))
             return torch.where(there, self._density(points), 0)
 
-        mesh = mesh_density(density_of, self._colour, self.frame, self.config.half_side)
-        return export_mesh(Path(folder) / "mesh.ply", mesh, self.origin)
+        half_side = self.config.half_side
+        return mesh_density(
+            density_of, self._colour, self.frame, half_side, resolution=resolution, origin=self.origin
+        )
 
     def _bound(
         self,

@@ -13,6 +13,8 @@ from torch import Generator, Tensor, nn
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.protocols import SamplerHook
 from visdom_plugin.methods.fields.common import (
+    MESH_RESOLUTION,
+    FieldMesh,
     LocalRays,
     bound_rays,
     export_mesh,
@@ -168,8 +170,13 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         )
 
     def export(self, folder: Path) -> list[Path]:
-        mesh = mesh_density(self._density, self._colour, self.frame, half_side=1.0)
-        return export_mesh(Path(folder) / "mesh.ply", mesh, self.origin)
+        return export_mesh(Path(folder) / "mesh.ply", self.mesh())
+
+    def mesh(self, resolution: int = MESH_RESOLUTION) -> FieldMesh | None:
+        """The surface in the capture's frame; see `mesh_density`."""
+        return mesh_density(
+            self._density, self._colour, self.frame, 1.0, resolution=resolution, origin=self.origin
+        )
 
     def _bound(
         self,
