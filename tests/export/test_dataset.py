@@ -35,6 +35,8 @@ def test_cameras_pictures_and_masks_come_back(tmp_path, scene, hull, data_format
         mask = np.asarray(scene.train.masks[i])
         assert np.array_equal(np.asarray(back.train.masks[i]), mask)
         assert np.array_equal(np.asarray(back.train.images[i])[mask], np.asarray(scene.train.images[i])[mask])
+    if data_format == "nerfstudio":  # its reader leaves the point cloud to nerfstudio
+        return
     assert back.points is not None
     inside = hull.contains(back.points[0], margin_voxels=1)
     assert inside.all() and len(inside) == 20_000
