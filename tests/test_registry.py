@@ -234,6 +234,15 @@ def test_a_variant_may_change_the_quick_settings_alone():
     assert presets["mine"].quick.width == presets["mine+mask"].quick.width == 3
 
 
+def test_settings_between_quick_and_full_have_their_variants():
+    vd = replace(SPEC, standard=Plain(16, steps=50)).presets()["mine+vd"]
+    assert (
+        vd.settings("standard") == replace(vd.full, width=16, steps=50) and vd.settings("quick") == vd.quick
+    )
+    with pytest.raises(ConfigError, match=r"method:mine\+vd has no settings between"):
+        SPEC.presets()["mine+vd"].settings("standard")
+
+
 def test_variants_may_change_more_and_full_keeps_its_own():
     presets = replace(
         SPEC, variants={"vd": {"width": 5, "vd": SamplerConfig(True, missing="skip")}}
@@ -254,6 +263,7 @@ def test_variants_may_change_more_and_full_keeps_its_own():
         ({"quick": Plain}, "quick is the class Plain"),
         ({"full": {"steps": 3}}, "full is dict"),
         ({"full": OwnWeight()}, "different classes"),
+        ({"standard": OwnWeight()}, "different classes"),
         ({"quick": Bare(), "full": None}, "Bare lacks mask_weight, hull, vd"),
         ({"hook": "gaussian"}, "field vd is SamplerConfig"),
         ({"quick_variants": {"vd": {"widht": 3}}}, "sets 'widht'"),

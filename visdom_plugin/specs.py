@@ -11,7 +11,7 @@ from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from importlib import import_module
 from typing import Any, ClassVar, Literal, Protocol
 
-from visdom_plugin.errors import PluginError
+from visdom_plugin.errors import ConfigError, PluginError
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
 from visdom_plugin.hull.domain import TRAINING_DOMAIN
 
@@ -51,12 +51,29 @@ class Preset:
 
     hook: str | None = None
     """"sampler" or "gaussian"; by default told by the settings in the config's field `vd`."""
+    standard: Settings | None = None
+    """Config dataclass for at most ten minutes on two CPU cores; None where there is nothing between the two."""
 
     def __post_init__(self) -> None:
         if self.hook is None:
             vd = getattr(self.quick, "vd", None)
             hook = next((name for name, settings in HOOKS.items() if isinstance(vd, settings)), None)
             object.__setattr__(self, "hook", hook)
+
+    def settings(self, budget: str) -> Settings:
+        """The config of a budget.
+
+        Raises:
+            ConfigError: the method has none for it.
+        """
+        if budget == "standard" and self.standard is None:
+            raise ConfigError(
+                f"method:{self.name} has no settings between quick and full",
+                where="--budget standard",
+                todo="give --budget quick or --budget full",
+            )
+        found: Settings = getattr(self, budget)
+        return found
 
     def load(self) -> type:
         """Imports the method's class.
@@ -127,6 +144,8 @@ class MethodSpec:
     """The same for the quick settings alone."""
     descriptions: Mapping[str, str] = field(default_factory=dict)
     """One line for a variant, in place of the one made from `description`."""
+    standard: Settings | None = None
+    """Settings between quick and full: at most ten minutes on two CPU cores at 400 x 400."""
     aliases: tuple[str, ...] = ()
     """Other names for it."""
 
@@ -144,13 +163,13 @@ class MethodSpec:
         demand(bool(target), f"target is {self.target!r}", 'write "module:Class", as text')
         if self.full is None:
             object.__setattr__(self, "full", self.quick)
-        for budget in ("quick", "full"):
+        for budget in ("quick", "full", *(["standard"] if self.standard is not None else [])):
             config = getattr(self, budget)
             plain = is_dataclass(config) and not isinstance(config, type)
             shown = f"the class {config.__name__}" if isinstance(config, type) else type(config).__name__
             demand(plain, f"{budget} is {shown}", "give an instance of a dataclass, such as Config()")
-        same = type(self.quick) is type(self.full)
-        demand(same, "quick and full are of different classes", "use one config dataclass for both")
+        same = {type(self.quick), type(self.full), type(self.standard or self.quick)}
+        demand(len(same) == 1, "quick and full are of different classes", "use one config dataclass for all")
         known = self.hook is None or self.hook in HOOKS
         demand(known, f"there is no hook {self.hook!r}", f"choose one of {', '.join(HOOKS)}, or None")
         names = {f.name for f in fields(self.quick)}
@@ -187,7 +206,9 @@ class MethodSpec:
                 made_up = f"{text or self.name}, {MADE.get(suffix, suffix)}"
                 text = self.descriptions.get(suffix, made_up)
             quick = replace(self._vary(self.quick, suffix), **self.quick_variants.get(suffix, {}))
-            made[name] = Preset(name, text, self.target, quick, self._vary(self.full, suffix), self.hook)
+            standard = None if self.standard is None else self._vary(self.standard, suffix)
+            full = self._vary(self.full, suffix)
+            made[name] = Preset(name, text, self.target, quick, full, self.hook, standard)
         for alias in self.aliases:
             made |= {name.replace(self.name, alias, 1): p for name, p in list(made.items()) if name == p.name}
         return made

@@ -71,7 +71,7 @@ def camera(width: int, height: int):
 def start(bench, name: str, scene, device: torch.device, *, budget: str = "quick", **changes):
     """A method set up on the training views: the method, a function from step to batch, and its config."""
     preset = project.find(name)
-    config = replace(getattr(preset, budget), **changes)
+    config = replace(preset.settings(budget), **changes)
     if bench.tiny:
         config = _shrink(config)
     method, _, _ = project.build(preset, config, scene.train, device=device, seed=0)

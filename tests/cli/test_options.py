@@ -33,6 +33,16 @@ def test_each_method_and_budget_has_its_own_defaults(preset, budget):
     assert asked.config == getattr(preset, budget) and type(asked.config) is FakeConfig
 
 
+def test_a_budget_between_quick_and_full_is_for_methods_that_have_one(monkeypatch):
+    with pytest.raises(ConfigError, match="method:fake has no settings between quick and full") as caught:
+        _parse("method:fake", "--budget", "standard")
+    assert caught.value.todo == "give --budget quick or --budget full"
+    between = replace(PRESET, standard=FakeConfig(steps=60))
+    asked = options.parse(["method:fake", "--budget", "standard"], find=lambda name: between)
+    assert asked.config == FakeConfig(steps=60) and asked.common.budget == "standard"
+    assert asked.note == "budget standard"
+
+
 def test_an_alias_is_the_method_itself():
     assert _parse("method:pretend").preset is _parse("method:fake").preset
 

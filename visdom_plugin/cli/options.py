@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 else:
     DataFormat = Literal[tuple(FORMATS)]
 Device = Literal["auto", "cpu", "cuda"]
-Budget = Literal["quick", "full"]
+Budget = Literal["quick", "standard", "full"]
 READING = (
     "views", "downscale", "seed", "missing_masks", "mask_source", "data_format", "train_list", "test_list",
     "split", "frame", "masks", "colmap_model", "invert_masks", "mask_path", "allow_outside",
@@ -109,8 +109,9 @@ class Common(FolderOptions):
 
     device: Device = "auto"
     """Where to compute; auto takes CUDA where there is one."""
-    budget: Literal["auto", "quick", "full"] = "auto"
-    """quick: minutes on two CPU cores; full: the published schedule; auto: quick on CPU, full on CUDA."""
+    budget: Literal["auto", "quick", "standard", "full"] = "auto"
+    """quick: a minute or two on two CPU cores; standard: up to ten, for methods that have such settings; full: the
+    published schedule; auto: quick on CPU, full on CUDA."""
     out: Path | None = None
     """Run directory; by default runs/<scene>/<views>/<method>/<seed>."""
     overwrite: bool = False
@@ -136,7 +137,7 @@ class Request:
     config: Any
     """The method's settings."""
     common: Common
-    """`budget` is "quick" or "full" here."""
+    """`budget` is not "auto" here."""
     note: str
     """One line on which budget was chosen and why."""
 
@@ -172,7 +173,7 @@ def parse(
     asked = early.budget or file.get("budget", "auto")
     device = early.device or file.get("device", "auto")
     budget, note = choose_budget(asked, device, ask_torch=not early.help)
-    config = getattr(preset, budget)
+    config = preset.settings(budget)
     common = Common()
     if file:
         given = {k: v for k, v in file.items() if k in SAVED}
@@ -270,7 +271,7 @@ def _without_method(early: Early, prog: str) -> NoReturn:
 
 
 def choose_budget(budget: str, device: str, ask_torch: bool = True) -> tuple[Budget, str]:
-    """ "quick" or "full", and why, from the options --budget and --device.
+    """ "quick", "standard" or "full", and why, from the options --budget and --device.
 
     Without `ask_torch`, a driver is taken for a CUDA device.
     """

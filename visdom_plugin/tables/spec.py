@@ -29,7 +29,7 @@ FACTS = (
     "views",
 )
 """Facts of the protocol that `varies` may name; see tables.protocol."""
-Budget = Literal["auto", "quick", "full"]
+Budget = Literal["auto", "quick", "standard", "full"]
 Settings = dict[str, object]
 """What a table file says by names, checked by whoever the names belong to."""
 T = TypeVar("T")
@@ -89,7 +89,7 @@ class TableFile:
     metrics: tuple[str, ...] = ("psnr",)
     """Names in run.json's metrics.test."""
     budget: Budget = "auto"
-    """quick, full or auto, as for visdom-train."""
+    """quick, standard, full or auto, as for visdom-train."""
     varies: tuple[str, ...] = ()
     """Facts of the protocol that may differ inside this table; see FACTS."""
     not_built: tuple[str, ...] = ()

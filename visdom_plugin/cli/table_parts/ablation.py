@@ -237,7 +237,7 @@ def _name_of(row: Row, request: Request) -> str:
 def _request(row: Row, budget: str, common: Common, note: str) -> Request:
     preset = registry.find(row.method)
     where = f"row {row.label!r}"
-    config = from_plain(getattr(preset, budget), nest(row.settings, where), where)
+    config = from_plain(preset.settings(budget), nest(row.settings, where), where)
     return Request(preset, config, common, note)
 
 

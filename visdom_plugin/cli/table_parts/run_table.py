@@ -54,7 +54,7 @@ class TableOptions:
     """In place of the table's."""
     only: tuple[str, ...] = ()
     """Labels of the rows to run; the others show what there is."""
-    budget: Literal["auto", "quick", "full"] | None = None
+    budget: Literal["auto", "quick", "standard", "full"] | None = None
     """In place of the table's."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA where there is one."""

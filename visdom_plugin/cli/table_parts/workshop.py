@@ -84,4 +84,4 @@ def _resolve(kind: str, method: str, budget: str, device: str, executor: str | N
         _refuse_misspelt(method, [*known.presets, *known.aliases])
         log.warning("not available: no installed package offers %r", method)
         return None
-    return Resolved(preset.name, budget, getattr(preset, budget))
+    return Resolved(preset.name, budget, preset.settings(budget))

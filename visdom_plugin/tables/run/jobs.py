@@ -34,7 +34,7 @@ class Resolved:
     name: str
     """The method's own name, aliases resolved."""
     budget: str
-    """quick or full."""
+    """quick, standard or full."""
     config: object
     """Settings dataclass of that budget."""
 
