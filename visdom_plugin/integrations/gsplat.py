@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable, Mapping, MutableMapping
+from functools import partial
 from importlib.metadata import version
 from types import ModuleType
 from typing import Literal
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.errors import CheckpointError, ConfigError, PluginError
-from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.geometry.cameras import Cameras, mean_distance
 from visdom_plugin.geometry.local_frame import require_near
 from visdom_plugin.hooks.protocols import Means
 from visdom_plugin.hooks.regularizer import Opacity, VisDomGaussianRegularizer
@@ -52,7 +53,7 @@ class VisDomStrategy:
             MCMCStrategy moves them to living ones and their number stays; "keep" them to the loss; "auto" fades
             beside MCMCStrategy and removes beside all others.
         render: draws opacity, `render(params, camera)` -> what `VisDomGaussianRegularizer.loss` takes; the default
-            is gsplat's own rasteriser, on CUDA.
+            is gsplat's own rasteriser, on CUDA, from a hundredth of the cameras' mean distance on.
         seed: of the loss's views, which depend on nothing else but the step.
 
     Raises:
@@ -71,7 +72,8 @@ class VisDomStrategy:
             raise ConfigError(f"outside is {outside!r}", todo='use "auto", "remove", "fade" or "keep"')
         extent = hook.hull.extent
         require_near(extent, float(np.ptp(extent, axis=0).max()), "VisDomStrategy")
-        self.hook, self.outside, self.render, self.seed = hook, outside, render or draw_opacity, seed
+        self.hook, self.outside, self.seed = hook, outside, seed
+        self.render = render or partial(draw_opacity, near=0.01 * float(mean_distance(hook.cameras)))
         self.ended = 0
         """Gaussians removed or faded so far; one that MCMCStrategy revives outside counts again."""
 
@@ -137,8 +139,12 @@ class VisDomStrategy:
         self.ended = saved["ended"]
 
 
-def draw_opacity(params: Params, camera: Cameras) -> Tensor:
-    """(H, W) opacity of gsplat's parameters by gsplat's own rasteriser, which needs CUDA."""
+def draw_opacity(params: Params, camera: Cameras, near: float = 0.01) -> Tensor:
+    """(H, W) opacity of gsplat's parameters by gsplat's own rasteriser, which needs CUDA.
+
+    Args:
+        near: Gaussians nearer than this are not drawn, scene units.
+    """
     rasterization = _gsplat().rasterization
     means = params["means"]
     _, alphas, _ = rasterization(
@@ -150,6 +156,7 @@ def draw_opacity(params: Params, camera: Cameras) -> Tensor:
         camera.camera_from_world.to(means)[None],
         camera.intrinsics.to(means)[None],
         *camera.size,
+        near_plane=near,
         packed=False,
     )
     return alphas[0, ..., 0]

@@ -96,7 +96,8 @@ def train(
         "config": as_plain(config),
         "data": describe_data(scene, request or {}),
     }
-    with RunDir.open(run_dir, finite(identity), overwrite=overwrite) as run:
+    defaults = as_plain(getattr(preset, budget or "quick"))
+    with RunDir.open(run_dir, finite(identity), overwrite=overwrite, defaults=defaults) as run:
         if run.record["status"] == "finished":
             return run.record | {"resumed_from": None, "already_finished": True}
         circumstances = {

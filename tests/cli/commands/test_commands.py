@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -263,7 +264,7 @@ def test_an_interrupted_training_says_that_the_same_command_resumes(fakes, capsy
     assert "resumed" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["--vews", "3"], ["--views", "many"], ["--budget", "huge"], ["extra"]])
+@pytest.mark.parametrize("words", [["--vews", "3"], ["--seed", "many"], ["--budget", "huge"], ["a", "b"]])
 def test_unknown_options_and_values_exit_2_and_name_the_word(fakes, capsys, words):
     with pytest.raises(SystemExit) as caught:
         train.main(["method:fake", *words])
@@ -317,3 +318,47 @@ def test_a_full_disk_or_a_wrong_path_is_not_called_a_bug(capsys, fault):
     assert entry.run(fail, []) == 2
     err = capsys.readouterr().err
     assert os.strerror(code) in err and "run/log.jsonl" in err and "bug" not in err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["method:fake", "--views", "4,6"], "--views is '4,6', and it takes one whole number"),
+        (["method:fake", "--views=many"], "--views is 'many'"),
+        (["method:fake", "nowhere"], "there is no such folder"),
+        (["nowhere"], "no method is named"),
+        (["method:fake", "scene", "--data", "other"], "two scenes: scene and other"),
+    ],
+)
+def test_slips_are_answered_in_our_own_words(fakes, capsys, words, says):
+    assert train.main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and says in error and "Python" not in error
+
+
+def test_method_and_scene_may_stand_as_plain_words(fakes, capsys, tmp_path):
+    (tmp_path / "scene").mkdir()
+    words = ["--method.steps", "12", "--out", "run", "--quiet"]
+    assert train.main(["fake", str(tmp_path / "scene"), *words]) == 0
+    ((path, _),) = fakes
+    assert path == tmp_path / "scene"
+    record = json.loads(Path("run/run.json").read_text())
+    assert record["method"] == "fake" and record["data"]["path"] == str(tmp_path / "scene")
+
+
+@pytest.mark.parametrize("command", [train.main, evaluate.main, render.main, methods.main])
+def test_every_command_says_its_version(capsys, command):
+    assert command(["--version"]) == 0
+    assert re.fullmatch(r"visdom-plugin \d+\.\d+\S*\n", capsys.readouterr().out)
+
+
+def test_a_mistake_in_the_scenes_name_needs_no_heavy_import():
+    code = (
+        "import sys\n"
+        "from visdom_plugin.cli.commands.train import main\n"
+        "assert main(['method:ingp', '/no/such/folder']) == 2\n"
+        "heavy = {'torch', 'numba', 'cv2', 'skimage', 'scipy'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -158,7 +158,7 @@ def test_training_samples_stay_within_the_hooks_bounds(method_class, scene, hull
         torch.full((200,), method.config.near / method.frame.scale),
         torch.full((200,), 3 / method.frame.scale),
     )
-    rays = method._bound(batch.origins, batch.directions, method.hooks)
+    rays = method.bound(batch.origins, batch.directions, method.hooks)
     assert torch.equal(rays.hit, bounds.hit) and 20 < int(rays.hit.sum()) < 180
     torch.testing.assert_close(rays.near[rays.hit], bounds.near[rays.hit] * method.frame.scale)
     assert (rays.far[rays.hit] <= bounds.far[rays.hit] * method.frame.scale + 1e-5).all()

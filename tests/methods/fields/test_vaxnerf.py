@@ -93,7 +93,7 @@ def test_the_hull_at_inference_leaves_training_as_it_is(scene, shards):
 def test_a_batch_beside_the_hull_teaches_nothing_and_breaks_nothing(scene, shards):
     method = start(Ingp, scene, shards, CONFIG)
     batch = DataManager(scene.train, seed=0).pixel_batch(1, 400)
-    hit = method._bound(batch.origins, batch.directions, method.hooks).hit
+    hit = method.bound(batch.origins, batch.directions, method.hooks).hit
     fields = {f: getattr(batch, f) for f in PixelBatch.__dataclass_fields__}
     beside = PixelBatch(**{f: None if v is None else v[~hit] for f, v in fields.items()})
     assert int((~hit).sum()) > 20

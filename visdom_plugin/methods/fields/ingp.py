@@ -10,12 +10,10 @@ from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.protocols import SamplerHook, sample_filters
-from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.fields.common import (
     MESH_RESOLUTION,
     FieldMesh,
     LocalRays,
-    bound_rays,
     export_mesh,
     mesh_density,
     photograph_on,
@@ -37,7 +35,6 @@ from visdom_plugin.nerf.sampling.occupancy_grid import (
     march,
     select,
 )
-from visdom_plugin.scene import Views
 from visdom_plugin.seeding import draw_on, generator, uniform
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
@@ -51,7 +48,7 @@ class Ingp(RadianceField[IngpConfig]):
     rays_at_once = 1 << 14
 
     def build(self, cameras: Cameras, generator: Generator) -> None:
-        c = self.config
+        c, self._rays = self.config, LEAST_RAYS
         self.table = torch.nn.Parameter(initial_table(c.grid, generator).to(self.device))
         self.density_net = perceptron([c.grid.width, c.hidden, 1 + c.geometry_features], generator).to(
             self.device
@@ -70,21 +67,9 @@ class Ingp(RadianceField[IngpConfig]):
         if c.drop_unsampled:
             # VaxNeRF's novel views do look at what training leaves out, so the grid must not hide it.
             hooks = [] if c.vd.drop_outside else self.hooks
-            parts = [self._bound(*spread_rays(cameras[i]), hooks) for i in range(len(cameras))]
+            parts = [self.bound(*spread_rays(cameras[i]), hooks) for i in range(len(cameras))]
             rays = LocalRays(*(torch.cat(x) for x in zip(*parts, strict=True)))
             self.occupancy.restrict(rays.origins, rays.directions, rays.near, rays.far)
-
-    def setup(
-        self,
-        views: Views,
-        hooks: Sequence[SamplerHook],
-        *,
-        hull: Hull | None,
-        device: torch.device,
-        seed: int,
-    ) -> None:
-        super().setup(views, hooks, hull=hull, device=device, seed=seed)
-        self._rays = LEAST_RAYS
 
     def pixels_per_step(self, step: int) -> int:
         """Pixels the next batch should have."""
@@ -98,7 +83,7 @@ class Ingp(RadianceField[IngpConfig]):
             self.occupancy.update(self._density, generator(self.seed, "occupancy", step), fraction=fraction)
         n = len(batch.mask)
         background = self.draw_background(n, draw)
-        rays = self._bound(batch.origins, batch.directions, self.hooks, batch.pixels)
+        rays = self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
         step_length = torch.where(rays.hit, c.step_length, c.missing_step_length)
         shift = uniform(draw, self.device, n)
         samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks)
@@ -121,7 +106,7 @@ class Ingp(RadianceField[IngpConfig]):
         self, origins: Tensor, directions: Tensor, radius: Tensor, background: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         hooks = self.hooks_at_inference()
-        rays = self._bound(origins, directions, hooks)
+        rays = self.bound(origins, directions, hooks)
         far = torch.where(rays.hit, rays.far, rays.near)
         step_length = torch.full_like(far, self.config.step_length)
         samples = self._take_samples(rays, far, step_length, torch.zeros_like(far), hooks)
@@ -158,16 +143,10 @@ class Ingp(RadianceField[IngpConfig]):
             density_of, self._colour, self.frame, half_side, resolution=resolution, origin=self.origin
         )
 
-    def _bound(
-        self,
-        origins: Tensor,
-        directions: Tensor,
-        hooks: Sequence[SamplerHook],
-        pixels: Tensor | None = None,
-    ) -> LocalRays:
+    def own_bounds(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         enter, leave = intersect_cube(self.frame.to_local(origins), directions.float(), self.config.half_side)
         near = enter.clamp_min(self.config.near)
-        return bound_rays(origins, directions, near, torch.maximum(leave, near), self.frame, hooks, pixels)
+        return near, torch.maximum(leave, near)
 
     def _take_samples(
         self, rays: LocalRays, far: Tensor, step_length: Tensor, shift: Tensor, hooks: Sequence[SamplerHook]

@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 from visdom_plugin.geometry.cameras import Cameras, pixel_radius
 from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook
 from visdom_plugin.hull.hull import Hull
-from visdom_plugin.methods.fields.common import render_image, spread_rays
+from visdom_plugin.methods.fields.common import LocalRays, bound_rays, render_image, spread_rays
 from visdom_plugin.methods.fields.configs import IngpConfig, ZipNerfConfig
 from visdom_plugin.nerf.frame import frame_of
 from visdom_plugin.nerf.optimiser import FieldOptimiser
@@ -63,6 +63,10 @@ class RadianceField(ABC, Generic[Config]):
         """Makes parameters and optimiser, for the training cameras (N,) on the method's device."""
 
     @abstractmethod
+    def own_bounds(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Near and far (n,) of rays in the world frame without hooks, in the field's frame."""
+
+    @abstractmethod
     def train_step(self, batch: PixelBatch, step: int) -> StepOutput: ...
 
     @abstractmethod
@@ -80,6 +84,17 @@ class RadianceField(ABC, Generic[Config]):
             self.frame,
             self.rays_at_once,
         )
+
+    def bound(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        hooks: Sequence[SamplerHook],
+        pixels: Tensor | None = None,
+    ) -> LocalRays:
+        """See `bound_rays`."""
+        near, far = self.own_bounds(origins, directions)
+        return bound_rays(origins, directions, near, far, self.frame, hooks, pixels)
 
     def hooks_at_inference(self) -> list[SamplerHook]:
         """The hooks that bound the rays of novel views."""

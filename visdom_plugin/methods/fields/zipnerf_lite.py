@@ -11,12 +11,10 @@ import torch
 from torch import Generator, Tensor, nn
 
 from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.hooks.protocols import SamplerHook
 from visdom_plugin.methods.fields.common import (
     MESH_RESOLUTION,
     FieldMesh,
     LocalRays,
-    bound_rays,
     export_mesh,
     mesh_density,
     photograph_on,
@@ -134,7 +132,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         c = self.config
         draw = draw_on(self.device, generator(self.seed, "step", step))
         background = self.draw_background(len(batch.mask), draw)
-        rays = self._bound(batch.origins, batch.directions, self.hooks, batch.pixels)
+        rays = self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
         progress = step / max(c.steps, 1)
         levels, colours = self._see(rays, batch.radii, c.samples, progress, draw)
         last = levels[-1]
@@ -178,16 +176,9 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
             self._density, self._colour, self.frame, 1.0, resolution=resolution, origin=self.origin
         )
 
-    def _bound(
-        self,
-        origins: Tensor,
-        directions: Tensor,
-        hooks: Sequence[SamplerHook],
-        pixels: Tensor | None = None,
-    ) -> LocalRays:
+    def own_bounds(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         near = torch.full(origins.shape[:-1], self.config.near, device=origins.device)
-        far = torch.full_like(near, self.config.far)
-        return bound_rays(origins, directions, near, far, self.frame, hooks, pixels)
+        return near, torch.full_like(near, self.config.far)
 
     def _see(
         self, rays: LocalRays, radius: Tensor, counts: Sequence[int], progress: float, generator: Generator
@@ -230,7 +221,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         self, origins: Tensor, directions: Tensor, radius: Tensor, background: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         # Level by level, for those rays that still may show something.
-        rays = self._bound(origins, directions, self.hooks_at_inference())
+        rays = self.bound(origins, directions, self.hooks_at_inference())
         counts = self.config.test_samples or self.config.samples
         n = len(rays.near)
         rgb, alpha, depth = background.expand(n, 3).clone(), torch.zeros_like(rays.near), rays.far.clone()

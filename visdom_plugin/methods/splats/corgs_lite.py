@@ -8,7 +8,6 @@ counterpart. Hooks, where there are any, give the initial points and add their l
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -16,9 +15,7 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin import seeding
-from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
-from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.losses import photometric_loss
 from visdom_plugin.methods.splats.common import draw_background, drop_some, fit_view
@@ -38,21 +35,7 @@ log = logging.getLogger(__name__)
 class CorgsLite(SplatMethod[CorgsConfig]):
     """See `visdom_plugin.training.protocols.Method` for what each call does. Set 0 is shown and exported."""
 
-    def setup(
-        self,
-        views: Views,
-        hooks: Sequence[GaussianHook],
-        *,
-        hull: Hull | None,
-        device: torch.device,
-        seed: int,
-    ) -> None:
-        if len(views) < 2:
-            raise SceneError(
-                f"corgs-lite compares its two sets between training cameras, and there is {len(views)}",
-                todo="give --views 2 or more",
-            )
-        super().setup(views, hooks, hull=hull, device=device, seed=seed)
+    fewest_views = 2
 
     def build(self, views: Views, hull: Hull | None, generator: Generator) -> None:
         c = self.config

@@ -6,7 +6,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import torch
 from torch import Generator, Tensor
@@ -37,6 +37,8 @@ log = logging.getLogger(__name__)
 class SplatMethod(ABC, Generic[Config]):
     """See `visdom_plugin.training.protocols.Method` for what each call does."""
 
+    fewest_views: ClassVar[int] = 1
+    """Training views the method can do with."""
     splats: GaussianSet
     """What is shown and exported; made by `build`."""
 
@@ -53,6 +55,11 @@ class SplatMethod(ABC, Generic[Config]):
         device: torch.device,
         seed: int,
     ) -> None:
+        if len(views) < self.fewest_views:
+            raise SceneError(
+                f"{type(self).__name__} compares training views, and there is {len(views)}",
+                todo=f"give --views {self.fewest_views} or more",
+            )
         self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
         if device.type == "cpu":
             log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")

@@ -113,12 +113,15 @@ class RunDir:
         self._is_new = False
 
     @classmethod
-    def open(cls, path: Path, identity: Record, *, overwrite: bool = False) -> RunDir:
+    def open(
+        cls, path: Path, identity: Record, *, overwrite: bool = False, defaults: Record | None = None
+    ) -> RunDir:
         """Creates the directory, or opens it when it holds the same run.
 
         Args:
             identity: the fields `IDENTITY`.
             overwrite: throw away the run that is there, unless it is the same one and was cut short.
+            defaults: of the config: what a run meant that was written before a setting was there.
 
         Raises:
             CheckpointError: when the directory holds another run or foreign files, or when another process
@@ -147,11 +150,11 @@ class RunDir:
             remove_parts(run.path)
             run._is_new = not (run.path / "run.json").exists()
             if not run._is_new:
-                if overwrite and not run._goes_on(identity):
+                if overwrite and not run._goes_on(identity, defaults):
                     run._clear()
                 else:
                     run.record = read_record(run.path)
-                    run._refuse_other(identity)
+                    run._refuse_other(identity, defaults)
             run.record = {"schema": SCHEMA, "status": "running", **run.record, **identity}
         except BaseException:
             run.close()
@@ -253,21 +256,23 @@ class RunDir:
             else:
                 target.unlink(missing_ok=True)
 
-    def _goes_on(self, identity: Record) -> bool:
+    def _goes_on(self, identity: Record, defaults: Record | None) -> bool:
         """Whether the directory holds this very run, interrupted or killed."""
         try:
             record = read_record(self.path)
         except CheckpointError:
             return False
-        same = not differences(_decisive(record), _decisive(identity))
+        same = not differences(_decisive(record, defaults), _decisive(identity))
         if not same or record.get("status") not in ("interrupted", "running"):
             return False
         log.info("the run directory holds this run, cut short: it goes on (--overwrite is for other runs)")
         return True
 
-    def _refuse_other(self, identity: Record) -> None:
-        if differences(_decisive(self.record), _decisive(identity)):
+    def _refuse_other(self, identity: Record, defaults: Record | None) -> None:
+        decisive = _decisive(self.record, defaults)
+        if differences(decisive, _decisive(identity)):
             there, now = ({name: record.get(name) for name in IDENTITY} for record in (self.record, identity))
+            there["config"] = decisive["config"]
             lines = differences(there, now)
             # What the data hash to follows from how they are read.
             lines = [line for line in lines if not line.startswith("data.hashes.")] or lines
@@ -287,13 +292,22 @@ def free_name(path: Path) -> Path:
     return free
 
 
-def _decisive(record: Record) -> Record:
+def _decisive(record: Record, defaults: Record | None = None) -> Record:
     """What must agree in two records of one run."""
+    if defaults is not None:
+        record = record | {"config": _filled(record.get("config"), defaults)}
     data = record.get("data")
     if isinstance(data, dict):
         # An option that nobody gave may be new since the record was written.
         data = {name: v for name, v in data.items() if name not in _WHEREABOUTS and v not in (None, False)}
     return {name: record.get(name) for name in IDENTITY if name != "scene"} | {"data": data}
+
+
+def _filled(config: object, defaults: object) -> object:
+    """A config as plain data, with the defaults of settings that it lacks."""
+    if not isinstance(config, dict) or not isinstance(defaults, dict):
+        return config
+    return defaults | {name: _filled(value, defaults.get(name)) for name, value in config.items()}
 
 
 def read_record(path: Path) -> Record:
