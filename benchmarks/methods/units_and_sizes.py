@@ -1,9 +1,9 @@
 """Quality in other units and at other sizes: python benchmarks/methods/units_and_sizes.py 3dgs-go+vd ingp+vd
 
-The built-in scene has its positions multiplied, or its photographs rendered smaller and larger, and each method
-trains its `quick` preset there. The PSNR should not depend on the unit but for rounding. At each size the test views
-are as large as the training views, which is what a user sees; averaged down to 100 pixels, more pixels should never
-make them worse.
+The built-in scene has its positions multiplied, or its photographs rendered smaller and larger, and each
+method trains its `quick` preset there. The PSNR should not depend on the unit but for rounding. At each size
+the test views are as large as the training views, which is what a user sees; averaged down to 100 pixels,
+more pixels should never make them worse.
 """
 
 import sys
