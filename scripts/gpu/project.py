@@ -30,7 +30,7 @@ _HOME = {
     "initial_table": "visdom_plugin.nerf.encoding.hash_grid",
     "load": "datamodules",
     "make_scene": "datamodules.synthetic.scene",
-    "march_occupied": "visdom_plugin.nerf.sampling.occupancy_grid:march",
+    "march_occupied": "visdom_plugin.nerf.sampling.occupancy_grid",
     "mask_loss": "visdom_plugin.losses",
     "offsets_of": "visdom_plugin.nerf.rendering.volume_packed",
     "outside_loss": "visdom_plugin.hooks.regularizer",

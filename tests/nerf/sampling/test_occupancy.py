@@ -3,7 +3,12 @@
 import pytest
 import torch
 
-from visdom_plugin.nerf.sampling.occupancy_grid import OccupancyGrid, _march_torch, intersect_cube, march
+from visdom_plugin.nerf.sampling.occupancy_grid import (
+    OccupancyGrid,
+    _march_torch,
+    intersect_cube,
+    march_occupied,
+)
 from visdom_plugin.seeding import generator
 
 
@@ -68,7 +73,7 @@ def test_few_cells_at_a_time_find_the_same_ball():
 
 def test_march_is_its_definition(grid):
     origins, directions, near, far, step, shift = rays = make_rays()
-    samples = march(*rays, grid)
+    samples = march_occupied(*rays, grid)
     n = grid.resolution
     for r in range(0, 300, 7):
         expected, i = [], 0
@@ -89,7 +94,7 @@ def test_march_is_its_definition(grid):
 
 def test_march_equals_its_torch_twin_and_any_number_of_threads(grid):
     rays = make_rays(2000, seed=3)
-    one, twin = march(*rays, grid), _march_torch(*rays, grid)
+    one, twin = march_occupied(*rays, grid), _march_torch(*rays, grid)
     # Rounding may put a middle on the other side of a cell's face.
     assert abs(len(one.ray) - len(twin.ray)) <= 2
     if len(one.ray) == len(twin.ray):
@@ -97,14 +102,14 @@ def test_march_equals_its_torch_twin_and_any_number_of_threads(grid):
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1 if threads > 1 else 2)
-        other = march(*rays, grid)
+        other = march_occupied(*rays, grid)
     finally:
         torch.set_num_threads(threads)
     for a, b in zip(one, other, strict=True):
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("walk", [march, _march_torch])
+@pytest.mark.parametrize("walk", [march_occupied, _march_torch])
 def test_samples_of_rays_that_start_outside_are_those_within_the_cube(walk):
     draw = generator(6)
     origins = 3 * torch.rand(500, 3, generator=draw) - 1.5
@@ -125,11 +130,11 @@ def test_rays_cut_to_the_cube_are_sampled_to_their_ends():
     lower = (origins + leave[:, None] * directions).amin(-1) < -0.9999
     rays = [x[lower] for x in (origins, directions, leave - 0.01, leave)]
     step, shift = torch.full((len(rays[0]),), 0.01), torch.full((len(rays[0]),), 0.49999)
-    samples = march(*rays, step, shift, OccupancyGrid(128, 1.0, threshold=1.0))
+    samples = march_occupied(*rays, step, shift, OccupancyGrid(128, 1.0, threshold=1.0))
     assert lower.sum() > 5000 and (samples.ray_offsets.diff() == 1).all()
 
 
-@pytest.mark.parametrize("walk", [march, _march_torch])
+@pytest.mark.parametrize("walk", [march_occupied, _march_torch])
 def test_no_rays_have_no_samples(grid, walk):
     offsets, ray, starts, ends = walk(*(x[:0] for x in make_rays()), grid)
     assert offsets.tolist() == [0] and (ray.dtype, starts.dtype) == (torch.int64, torch.float32)

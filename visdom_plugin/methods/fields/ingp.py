@@ -32,7 +32,7 @@ from visdom_plugin.nerf.sampling.occupancy_grid import (
     OccupancyGrid,
     PackedSamples,
     intersect_cube,
-    march,
+    march_occupied,
     select,
 )
 from visdom_plugin.seeding import draw_on, generator, uniform
@@ -151,7 +151,9 @@ class Ingp(RadianceField[IngpConfig]):
     def _take_samples(
         self, rays: LocalRays, far: Tensor, step_length: Tensor, shift: Tensor, hooks: Sequence[SamplerHook]
     ) -> PackedSamples:
-        samples = march(rays.origins, rays.directions, rays.near, far, step_length, shift, self.occupancy)
+        samples = march_occupied(
+            rays.origins, rays.directions, rays.near, far, step_length, shift, self.occupancy
+        )
         for hook in sample_filters(hooks):
             samples = select(samples, hook.keep(self.frame.to_world(_points(rays, samples))))
         return samples

@@ -203,7 +203,7 @@ def _touch(origins, directions, near, far, step, touched, half_side):
             t += step
 
 
-def march(
+def march_occupied(
     origins: Tensor,
     directions: Tensor,
     near: Tensor,
