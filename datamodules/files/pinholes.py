@@ -65,14 +65,10 @@ def pinholes(
                 cause="a scaled or mirrored pose, or a damaged file",
                 todo="remove scale and reflection from the matrices, or estimate the poses again",
             )
-    matrices = np.zeros((len(names), 3, 3))
+    matrices, poses = np.zeros((len(names), 3, 3)), np.zeros((len(names), 4, 4))
     matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]] = K
-    matrices[:, 2, 2] = 1
+    matrices[:, 2, 2] = poses[:, 3, 3] = 1
+    poses[:, :3] = motion * np.array([1, -1, -1, 1] if convention == "opengl" else [1, 1, 1, 1])
     widths, heights = torch.tensor(sizes, dtype=torch.int64).reshape(-1, 2).unbind(1)
-    return Cameras.from_matrices(
-        torch.from_numpy(matrices),
-        torch.from_numpy(np.ascontiguousarray(motion)),
-        width=widths,
-        height=heights,
-        convention=convention,
-    )
+    # Not through `from_matrices`: what it refuses in numbers of a library's caller, the check explains of a file.
+    return Cameras(torch.from_numpy(matrices), torch.from_numpy(poses), widths, heights)

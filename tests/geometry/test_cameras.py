@@ -197,3 +197,36 @@ def test_only_one_batch_of_cameras_will_do():
 def test_unknown_convention_lists_the_known_ones():
     with pytest.raises(SceneError, match="opengl"):
         Cameras.from_matrices(np.eye(3), np.eye(4), width=10, height=10, convention="blender")
+
+
+K = np.array([[110.0, 0, 52.5], [0, 115.0, 37.0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (np.diag([1 / 100, 1 / 80, 1]) @ K, "fractions(.|\n)*first row by the width"),
+        (
+            np.array([[110, 0, 0.525], [0, 115, 0.46], [0, 0, 1]]),
+            "centre left at 0(.|\n)*cx near width",
+        ),
+        (np.diag([110, 115, 1]), "left at 0"),
+        (np.array([[0.85, 0, 50], [0, 0.68, 40], [0, 0, 1]]), "an angle"),
+    ],
+)
+def test_intrinsics_in_another_unit_are_refused(wrong, words):
+    for batch in (wrong, np.stack([K, wrong])):
+        with pytest.raises(SceneError, match=f"not in pixels(.|\n)*{words}"):
+            Cameras.from_matrices(batch, np.eye(4), width=100, height=80)
+
+
+def test_angles_in_degrees_are_refused_where_no_lens_is_so_wide():
+    wrong = np.array([[49.0, 0, 600], [0, 38.0, 400], [0, 0, 1]])
+    with pytest.raises(SceneError, match=r"an angle(.|\n)*tan"):
+        Cameras.from_matrices(wrong, np.eye(4), width=1200, height=800)
+
+
+def test_off_centre_crops_and_tiny_images_are_cameras():
+    crop = np.array([[110, 0, -7.0], [0, 115, 90.0], [0, 0, 1]])
+    assert Cameras.from_matrices(crop, np.eye(4), width=100, height=80).shape == ()
+    assert Cameras.from_matrices(np.eye(3) + 0, np.eye(4), width=1, height=1).shape == ()

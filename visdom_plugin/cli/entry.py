@@ -10,6 +10,7 @@ from importlib.metadata import version
 
 from visdom_plugin.cli.early import read_early
 from visdom_plugin.errors import ConfigError, VisDomError
+from visdom_plugin.hull.checks.wording import for_commands
 
 USER_ERROR, INTERRUPTED = 2, 130
 BUG = "this is a bug in visdom-plugin or in a plugin; please report it with:"
@@ -41,7 +42,8 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
         return 0
     try:
         _check_views(early.views)
-        return command(words) or 0
+        with for_commands():
+            return command(words) or 0
     except VisDomError as error:
         print(f"error: {error}", file=sys.stderr)
         return USER_ERROR

@@ -60,7 +60,8 @@ class Cameras:
         Raises:
             SceneError: for NaN or infinite numbers; a last row of a motion other than (0, 0, 0, 1), or of K other
                 than (0, 0, 1), as transposed matrices have them; a rotation part that is not a rotation; a skewed
-                or non-positive focal length; an empty image; an unknown convention; or counts that do not match.
+                or non-positive focal length; K in fractions of the image or angles; an empty image; an unknown
+                convention; or counts that do not match.
         """
         motion = _as_tensor(world_from_camera)
         motion = motion if motion.is_floating_point() else motion.double()
@@ -92,6 +93,7 @@ class Cameras:
         size = _sizes(batch, motion.device, width=width, height=height)
         cameras = cls(intrinsics.expand(*batch, 3, 3), motion.expand(*batch, 4, 4), *size)
         _check(cameras)
+        _check_units(cameras)
         return cameras
 
     @classmethod
@@ -261,6 +263,26 @@ def _check(cameras: Cameras) -> None:
     bad = (cameras.width <= 0) | (cameras.height <= 0)
     if bad.any():
         raise SceneError(f"width and height of {_which(bad)} must be positive")
+
+
+def _check_units(cameras: Cameras) -> None:
+    """Refuses intrinsics that are no pixels. Images of less than 16 pixels are too small to tell."""
+    K, size = cameras.intrinsics, torch.stack([cameras.width, cameras.height], -1)
+    focal, centre = torch.stack([K[..., 0, 0], K[..., 1, 1]], -1), K[..., :2, 2]
+    cornered = ((centre >= 0) & (centre <= 1)).all(-1)
+    bad = (size >= 16).all(-1) & (cornered | (focal * 16 < size).any(-1))
+    if not bad.any():
+        return
+    fx, fy, cx, cy, w, h = torch.cat([focal, centre, size], -1)[bad].reshape(-1, 6)[0].tolist()
+    cause, todo = "an angle or millimetres as focal length", "pass fx = width / (2 tan(angle / 2)), fy alike"
+    if cornered[bad].any():
+        cause, todo = (
+            "fractions of the image, or a centre left at 0",
+            "pass cx about width / 2, cy about height / 2",
+        )
+        todo = "multiply K's first row by the width, its second by the height" if min(fx, fy) < 4 else todo
+    values = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} for an image of {w:g} x {h:g}"
+    raise SceneError(f"K of {_which(bad)} is not in pixels: {values}", cause=cause, todo=todo)
 
 
 def _row(rows: Tensor, bad: Tensor) -> str:

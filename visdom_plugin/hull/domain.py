@@ -61,6 +61,7 @@ class VisibleDomain(HullSettings):
         from visdom_plugin.hull.carving.votes import gather_silhouettes
         from visdom_plugin.hull.checks.coverage import explains_enough
         from visdom_plugin.hull.checks.mask_checks import look_inverted
+        from visdom_plugin.hull.checks.wording import wording
 
         log.info("carving the hull (the first time on a machine its kernels are compiled: 10 to 30 s)")
         silhouettes = gather_silhouettes(cameras, masks, self.dilate_px)
@@ -94,10 +95,10 @@ class VisibleDomain(HullSettings):
         inverted = [i for i in range(len(silhouettes)) if look_inverted(silhouettes.mask(i))]
         if 2 * len(inverted) > len(silhouettes):
             log.warning(
-                "%d of %d masks are foreground along most of the image's border: they may mark the background; "
-                "`visdom-hull --diagnose` tells more",
+                "%d of %d masks are foreground along most of the image's border: they may mark the background; %s",
                 len(inverted),
                 len(silhouettes),
+                wording().look,
             )
         made, dropped = hull.summary, hull.summary["components_dropped"]
         log.info(

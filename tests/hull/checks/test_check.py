@@ -17,7 +17,7 @@ from tests.hull.checks.faults import FAULTS, Capture, capture_of, clustered, jud
 from visdom_plugin.geometry.cameras import Cameras, project
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.check import check
-from visdom_plugin.hull.checks.covisibility import IN_COMMANDS, advise_k, measure_spread
+from visdom_plugin.hull.checks.covisibility import advise_k, measure_spread
 from visdom_plugin.hull.checks.distance_fields import draw_outlines, signed_distance
 from visdom_plugin.hull.checks.mask_checks import border_contact, count_specks
 from visdom_plugin.hull.checks.silhouette_consistency import (
@@ -27,6 +27,7 @@ from visdom_plugin.hull.checks.silhouette_consistency import (
     march_rays,
     measure_coherence,
 )
+from visdom_plugin.hull.checks.wording import for_commands
 from visdom_plugin.hull.domain import VisibleDomain
 
 BOX = ((-0.4, -0.5, -0.3), (0.5, 0.3, 0.4))
@@ -339,7 +340,8 @@ def test_a_k_that_asks_too_much_is_a_finding(captures):
     found = examine(captures("built-in", 4), k=9)
     assert [f.kind for f in found.findings] == ["covisibility"] and "9" in found.findings[0].what
     assert found.findings[0].todo.startswith("use K = 3 (VisibleDomain(k=3)), or views")
-    said = examine(captures("built-in", 4), k=9, set_k=IN_COMMANDS).findings[0].todo
+    with for_commands():
+        said = examine(captures("built-in", 4), k=9).findings[0].todo
     assert "(visdom-hull -k 3, visdom-train --method.hull.k 3)" in said
 
 

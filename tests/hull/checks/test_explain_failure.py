@@ -2,6 +2,7 @@
 
 import os
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,9 @@ from tests.hull.balls import ball_masks, box_masks, moved, random_cameras, ring
 from visdom_plugin.errors import EmptyHullError, SceneError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import gather_silhouettes
+from visdom_plugin.hull.checks import explain_failure
 from visdom_plugin.hull.checks.coverage import estimate_coverage, measure_coverage
+from visdom_plugin.hull.checks.wording import for_commands
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
 
@@ -71,7 +74,7 @@ def test_k_above_co_visibility(capture):
     error = cause_of(replace(SMALL, k=6), cameras, masks)
     assert "too little is seen in common for K = 6" in error.cause and error.where == "k"
     assert re.search(r"K = \d would lose \d+\.\d% of the mask of view \d", error.cause)
-    assert all(said in error.todo for said in ("visdom-hull -k 2", "--method.hull.k 2", "VisibleDomain(k=2)"))
+    assert "VisibleDomain(k=2)" in error.todo and "visdom-" not in error.todo
     assert replace(SMALL, k=2).carve(cameras, masks).voxels
 
 
@@ -114,7 +117,7 @@ def test_poses_of_another_convention(capture, spoil, words):
         hull = SMALL.carve(wrong, masks)
     except EmptyHullError as error:
         assert words in error.cause and "0.00% of the object's length in the mean in place of" in error.cause
-        assert error.where == "camera poses" and "`visdom-check DIR`" in error.todo
+        assert error.where == "camera poses" and "visdom-" not in error.todo
     else:
         # Wrong poses may agree somewhere by chance; then coverage shows it.
         assert min(c.covered for c in measure_coverage(hull, wrong, masks)) < 0.9
@@ -234,3 +237,25 @@ def test_the_quick_look_sees_nothing_that_is_not_there(seed):
     nothing = Hull.from_grid(np.ones((2, 2, 2)), [[190] * 3, [191] * 3])
     assert estimate_coverage(full, cameras, silhouettes) == 1
     assert estimate_coverage(nothing, moved(cameras, np.eye(3), 1.0, [0.0, 0, -500]), silhouettes) == 0
+
+
+@pytest.mark.parametrize(
+    "who, mine, other", [(nullcontext, "VisibleDomain(k=3)", "--"), (for_commands, "-k 3", "VisibleD")]
+)
+def test_errors_speak_to_who_asked(who, mine, other):
+    cameras = ring(4, size=48)
+    with who(), pytest.raises(EmptyHullError) as error:
+        VisibleDomain(k=9, resolution=32).carve(cameras, ball_masks(cameras, [((0, 0, 0), 0.5)]))
+    assert mine in str(error.value) and other not in str(error.value)
+
+
+@pytest.mark.parametrize("who, other", [(nullcontext, ("visdom-", "--")), (for_commands, ("VisibleDomain",))])
+def test_what_may_miss_is_said_to_who_asked(who, other, monkeypatch):
+    monkeypatch.setattr(explain_failure, "_faults", lambda *_: [])
+    cameras = ring(4, size=48)
+    masks = [torch.zeros(48, 48, dtype=torch.bool) for _ in range(4)]
+    for i, mask in enumerate(masks):
+        mask[12 * i : 12 * i + 3, :4] = True
+    with who(), pytest.raises(EmptyHullError, match="misses") as error:
+        VisibleDomain(k=3, resolution=32, bounds=((-1, -1, -1), (1, 1, 1))).carve(cameras, masks)
+    assert not any(word in str(error.value) for word in other)

@@ -133,12 +133,11 @@ def check_views(
 ) -> Check:
     """`hull.check.check` of a scene's views; `layout` is that of a scene on disk."""
     from visdom_plugin.hull.checks.check import check
-    from visdom_plugin.hull.checks.covisibility import IN_COMMANDS
     from visdom_plugin.hull.checks.pose_conventions import pose_faults
 
     images = () if brief else views.images
     poses = pose_faults(layout)
-    return check(views.cameras, masks, images, views.names, k=k, brief=brief, poses=poses, set_k=IN_COMMANDS)
+    return check(views.cameras, masks, images, views.names, k=k, brief=brief, poses=poses)
 
 
 def describe_check(found: Check, names: Sequence[str], *, inverted: bool = False) -> dict[str, Any]:

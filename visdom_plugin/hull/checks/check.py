@@ -13,7 +13,6 @@ from torch import Tensor
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.covisibility import (
-    IN_PROGRAM,
     LEAST_K,
     LOST,
     USUAL_K,
@@ -33,6 +32,7 @@ from visdom_plugin.hull.checks.mask_checks import (
 )
 from visdom_plugin.hull.checks.pose_conventions import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.checks.silhouette_consistency import Coherence, measure_coherence
+from visdom_plugin.hull.checks.wording import wording
 from visdom_plugin.hull.foreign import to_numpy
 
 CLUSTERED_DEGREES = 60.0
@@ -70,7 +70,6 @@ def check(
     k: int | None = None,
     brief: bool = False,
     poses: PoseFaults = IN_MEMORY,
-    set_k: str = IN_PROGRAM,
 ) -> Check:
     """Looks for every fault that shows in cameras and masks, and for photographs that occur twice.
 
@@ -82,7 +81,6 @@ def check(
         k: the K that is going to be used; by default it is to be advised.
         brief: a fraction of a second; names a fault but not always its cause, and compares 16 views at most.
         poses: what to say of wrong poses, in the terms of where they are from.
-        set_k: how K is set there, with {k} for its value.
     """
     own = [to_numpy(m).astype(bool) for m in masks]
     names = Name.numbered(len(own)) if names is None else Name(names)
@@ -127,7 +125,7 @@ def check(
     if left.sum() >= 2 and not any(c.kind in ("axes", "scale", "order", "swapped") for c in causes):
         kept = Name([names[i] for i in usable[left]])
         advice = advise_k(rest, kept, fit, USUAL_K if k is None else k)
-        found += _covisibility(advice, usable[left], k, names, set_k)
+        found += _covisibility(advice, usable[left], k, names)
         found += _clustered(rest, fit, chosen)
     notes, found = _split(found)
     found.sort(key=lambda f: ("certain", "likely", "possible").index(f.sure))
@@ -146,7 +144,7 @@ def _too_few(count: int) -> Finding:
         tuple(range(count)),
         "certain",
         count,
-        "use more views: --views 3 or more",
+        wording().more_views,
     )
 
 
@@ -305,13 +303,11 @@ def _disagreement(fit: Coherence, views: np.ndarray, names: Name) -> Finding:
         named,
         "likely" if share > 0.1 else "possible",
         share,
-        "look at the contact sheet (--out DIR); check poses and intrinsics, then the masks of these views",
+        f"{wording().sheet}; check poses and intrinsics, then the masks of these views",
     )
 
 
-def _covisibility(
-    advice: Advice, views: np.ndarray, asked: int | None, names: Name, set_k: str
-) -> list[Finding]:
+def _covisibility(advice: Advice, views: np.ndarray, asked: int | None, names: Name) -> list[Finding]:
     if not advice.covered:
         return []
     wanted, found = USUAL_K if asked is None else asked, []
@@ -321,7 +317,8 @@ def _covisibility(
         else:
             what = f"too little is seen in common for K = {wanted}: {advice.why.partition(': ')[2]}"
             lost = advice.covered[LEAST_K] - advice.covered[advice.k + 1]
-        todo = f"use K = {advice.k} ({set_k.format(k=advice.k)}), or views that show more of the object in common"
+        set_k = wording().set_k.format(k=advice.k)
+        todo = f"use K = {advice.k} ({set_k}), or views that show more of the object in common"
         found.append(_seen(what, views, lost, todo, note=asked is None))
     alone = advice.covered[1] - advice.covered[LEAST_K]
     if alone.max() > LOST:

@@ -18,9 +18,6 @@ from visdom_plugin.hull.checks.silhouette_consistency import (
 
 USUAL_K, LEAST_K = 3, 2
 """K = 1 is never advised: what one view alone sees is closed by no other, and its hull reaches the cameras."""
-IN_PROGRAM = "VisibleDomain(k={k})"
-IN_COMMANDS = "visdom-hull -k {k}, visdom-train --method.hull.k {k}"
-"""How K is set, for sentences."""
 LOST = 0.02
 """A K may leave this share of a mask's rays without support beyond what LEAST_K leaves."""
 _TOLERANCE_PX = 1.0

@@ -20,16 +20,14 @@ from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Silhouettes
 from visdom_plugin.hull.checks.check import check
 from visdom_plugin.hull.checks.coverage import POOR_COVERAGE, measure_coverage
-from visdom_plugin.hull.checks.covisibility import IN_COMMANDS, IN_PROGRAM, LEAST_K, USUAL_K
+from visdom_plugin.hull.checks.covisibility import LEAST_K, USUAL_K
 from visdom_plugin.hull.checks.findings import Finding, Name
+from visdom_plugin.hull.checks.wording import COMMANDS, wording
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.settings import HullSettings
 
 log = logging.getLogger(__name__)
 
-_SET_K = f"{IN_COMMANDS}, {IN_PROGRAM}"
-"""A carve does not know who asked for it."""
-_LOOK = "look at each view's part in it: visdom-hull DIR --diagnose"
 _COARSE = 64
 """Voxels per side of a trial hull."""
 _CONVINCING = 0.9
@@ -62,7 +60,7 @@ def explain_empty(settings: HullSettings, cameras: Cameras, silhouettes: Silhoue
     if fault is None and k > views:
         only = "is only 1 view" if views == 1 else f"are only {views} views"
         fewer = min(USUAL_K, views)
-        less = f", or K = {fewer} ({_SET_K.format(k=fewer)}) or less" if views >= LEAST_K else ""
+        less = f", or K = {fewer} ({wording().set_k.format(k=fewer)}) or less" if views >= LEAST_K else ""
         return EmptyHullError(
             what,
             where="k",
@@ -77,7 +75,7 @@ def explain_empty(settings: HullSettings, cameras: Cameras, silhouettes: Silhoue
         fault = next(iter(faults), None)
     if fault is None:
         return EmptyHullError(
-            what, todo=f"{_LOOK}, or let some views miss: --max-misses 1, VisibleDomain(max_misses=1)"
+            what, todo=f"{wording().look}, or let some views miss: {wording().allow_misses}"
         )
     return EmptyHullError(what, where=_where(fault), cause=_cause(fault), todo=_todo(fault))
 
@@ -105,12 +103,12 @@ def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouett
             f"{what}, and is a speck: {size:.2g} long, {distance:.2g} from the cameras",
             where="camera poses" if fault is None else _where(fault),
             cause=meeting if fault is None else _cause(fault),
-            todo=_LOOK if fault is None else _todo(fault),
+            todo=wording().look if fault is None else _todo(fault),
         )
     if fault is not None:
         return f"{what}; {_cause(fault)}; {_todo(fault)}"
     few = f", or too little is seen by K = {settings.k} views" if settings.kind == "visdom" else ""
-    return f"{what}; poses, intrinsics or masks of some views are wrong{few}; {_LOOK}"
+    return f"{what}; poses, intrinsics or masks of some views are wrong{few}; {wording().look}"
 
 
 def _faults(settings: HullSettings, cameras: Cameras, silhouettes: Silhouettes) -> list[Finding]:
@@ -118,7 +116,7 @@ def _faults(settings: HullSettings, cameras: Cameras, silhouettes: Silhouettes) 
     masks = [silhouettes.mask(i) for i in range(len(silhouettes))]
     rule = KeepRule.of(settings, len(silhouettes))
     asked = rule.least_visible if settings.kind == "visdom" else None
-    found = check(cameras, masks, k=asked, set_k=_SET_K)
+    found = check(cameras, masks, k=asked)
     groups: dict[str, list[Finding]] = {}
     for f in found.findings:
         # Equal masks that fit the others are those of a symmetric object.
@@ -149,7 +147,8 @@ def _todo(fault: Finding) -> str:
     if fault.kind != "axes":
         return fault.todo
     # A reader turns a file's poses into those of Cameras: which of the two is at fault is not seen here.
-    return f"{fault.todo}; of a scene on disk, `visdom-check DIR` tells what its file holds wrongly"
+    tells = "; `visdom-check DIR` tells what the scene's file holds wrongly" if wording() is COMMANDS else ""
+    return fault.todo + tells
 
 
 def _mean_coverage(hull: Hull, cameras: Cameras, silhouettes: Silhouettes) -> float:

@@ -1,0 +1,53 @@
+"""Wording of advice: arguments for who calls the library, options for who runs a command."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import NamedTuple
+
+
+class Wording(NamedTuple):
+    """What to do, in the terms of who asked."""
+
+    set_k: str
+    """How K is set; {k} stands for its value."""
+    allow_misses: str
+    look: str
+    """Where each view's part in a hull is shown."""
+    more_views: str
+    sheet: str
+    """Where views and outlines are shown."""
+
+
+LIBRARY = Wording(
+    set_k="VisibleDomain(k={k})",
+    allow_misses="VisibleDomain(max_misses=1)",
+    look="see what visdom_plugin.hull.checks.check.check(cameras, masks) finds",
+    more_views="use three views or more",
+    sheet="draw masks and hull over the photographs",
+)
+COMMANDS = Wording(
+    set_k="visdom-hull -k {k}, visdom-train --method.hull.k {k}",
+    allow_misses="visdom-hull --max-misses 1, visdom-train --method.hull.max-misses 1",
+    look="look at each view's part in it: visdom-hull DIR --diagnose",
+    more_views="use more views: --views 3 or more",
+    sheet="look at the contact sheet (visdom-check DIR --out OUT)",
+)
+_current: ContextVar[Wording] = ContextVar("wording", default=LIBRARY)
+
+
+def wording() -> Wording:
+    """The terms of who asked: the library's outside of commands."""
+    return _current.get()
+
+
+@contextmanager
+def for_commands() -> Iterator[None]:
+    """Advice within is given as options of the commands."""
+    token = _current.set(COMMANDS)
+    try:
+        yield
+    finally:
+        _current.reset(token)
