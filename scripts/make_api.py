@@ -13,7 +13,9 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "api.md"
 MODULES = {
+    "datamodules/recognise.py": "Loading a scene",
     "visdom_plugin/geometry/cameras.py": "Cameras and rays",
+    "visdom_plugin/geometry/camera_paths.py": "Camera paths",
     "visdom_plugin/hull/domain.py": "Carving",
     "visdom_plugin/hull/settings.py": "Settings of a hull",
     "visdom_plugin/hull/hull.py": "The hull",
@@ -26,14 +28,38 @@ MODULES = {
     "visdom_plugin/integrations/nerfacc.py": "nerfacc",
     "visdom_plugin/render.py": "Renders",
     "visdom_plugin/scene.py": "Scenes",
+    "visdom_plugin/losses.py": "Losses",
+    "visdom_plugin/specs.py": "Offering a method",
+    "visdom_plugin/registry.py": "Finding methods",
+    "visdom_plugin/training/protocols.py": "What a method is",
+    "visdom_plugin/training/batches.py": "Batches",
+    "visdom_plugin/training/run.py": "Training and opening runs",
+    "visdom_plugin/training/evaluate.py": "Rendering views",
+    "visdom_plugin/methods/fields/common.py": "Helpers for radiance fields",
+    "visdom_plugin/nerf/frame.py": "A radiance field's frame",
+    "visdom_plugin/nerf/rendering/volume.py": "Volume rendering",
+    "visdom_plugin/nerf/optimiser.py": "The optimiser of radiance fields",
     "visdom_plugin/errors.py": "Errors",
 }
-WITH_FUNCTIONS = {"gsplat", "nerfacc"}
-"""Sections whose functions are listed, too; elsewhere classes only."""
+WITH_FUNCTIONS = {
+    "gsplat": None,
+    "nerfacc": None,
+    "Losses": None,
+    "Camera paths": None,
+    "Loading a scene": {"load"},
+    "Cameras and rays": {"project", "rays_of", "look_at_point"},
+    "Finding methods": {"installed", "find"},
+    "Training and opening runs": {"train", "restore", "evaluate_again", "export"},
+    "Rendering views": {"render_on_white"},
+    "Helpers for radiance fields": None,
+    "A radiance field's frame": None,
+    "Volume rendering": {"composite", "weights_from_density"},
+}
+"""Sections whose functions are listed, too, all or those named; elsewhere classes only."""
 HEAD = """# Python API
 
 Made from the docstrings by `python scripts/make_api.py`. Shapes stand in brackets; `...` is any leading shape.
-Names without a module in their heading are imported from `visdom_plugin`.
+Names without a module in their heading are imported from `visdom_plugin`, `load` from `datamodules`.
 """
 
 
@@ -52,7 +78,7 @@ def make_page() -> str:
             name = node.name if public.get(node.name) == module else f"{module}.{node.name}"
             if isinstance(node, ast.ClassDef):
                 parts += describe_class(node, name, lines)
-            elif title in WITH_FUNCTIONS:
+            elif title in WITH_FUNCTIONS and node.name in (WITH_FUNCTIONS[title] or {node.name}):
                 parts += [f"### `{name}`\n", f"```\n{signature(node, lines)}\n```\n", describe(node)]
     return "\n".join(part for part in parts if part).rstrip() + "\n"
 

@@ -175,7 +175,7 @@ def describe_masks(views: Views) -> list[str]:
     Reads no pixels where there is nothing but given masks.
     """
     known = {
-        "given": "foreground masks: outside is known to be empty",
+        "given": "foreground masks; the background is known to be empty",
         "missing": "views without a mask",
         "hull": "views whose mask is the outline of the other views' hull (they do not carve)",
         "colour": "views without a mask, for colour only inside the other views' hull (no carving, no mask loss)",

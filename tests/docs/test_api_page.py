@@ -1,6 +1,8 @@
 """docs/api.md says what the docstrings say."""
 
+import ast
 import importlib.util
+import re
 from pathlib import Path
 
 import visdom_plugin
@@ -28,9 +30,20 @@ def test_every_public_name_has_a_heading_and_a_description():
     assert "margin_voxels" in described["Hull"] and "_derived" not in described["Hull"]
 
 
-def test_sections_of_a_docstring_become_lists():
-    import ast
+def test_what_the_example_imports_is_described():
+    page = make_api().make_page()
+    for path in (ROOT / "examples/my_method/my_method").glob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in [
+            n for n in tree.body if isinstance(n, ast.ImportFrom) and n.module.startswith("visdom_plugin")
+        ]:
+            for name in node.names:
+                assert re.search(rf"^### `[\w.]*\b{name.name}\b", page, re.MULTILINE), (
+                    f"{node.module}.{name.name}"
+                )
 
+
+def test_sections_of_a_docstring_become_lists():
     source = '''
 def f(a, b):
     """One line.

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 HOSTS = {"gsplat.md": "gsplat", "nerfacc.md": "nerfacc", "nerfstudio.md": "nerfstudio"}
 
 

@@ -301,7 +301,7 @@ def resolve_device(device: str) -> str:
             "there is no CUDA device",
             where="--device cuda",
             cause="no NVIDIA driver, or a CPU build of torch",
-            todo="leave --device out, or look at `visdom-methods --doctor`",
+            todo="leave --device out, or see what `visdom-methods --doctor` finds",
         )
     return device
 

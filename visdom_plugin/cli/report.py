@@ -60,8 +60,8 @@ def show_result(record: dict[str, Any], folder: Path) -> None:
     for name, count in record.get("model", {}).items():
         console.print(f"model: {count:,} {name.capitalize()}", highlight=False)
     for label, name in (
-        ("look at", "renders/test_sheet.png"),
-        ("look at", "renders/training_sheet.png"),
+        ("sheet", "renders/test_sheet.png"),
+        ("sheet", "renders/training_sheet.png"),
         ("orbit", "renders/orbit_sheet.png"),
         ("renders", "renders/test"),
         ("export", "export"),

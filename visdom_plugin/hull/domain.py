@@ -63,7 +63,7 @@ class VisibleDomain(HullSettings):
         from visdom_plugin.hull.checks.mask_checks import look_inverted
         from visdom_plugin.hull.checks.wording import wording
 
-        log.info("carving the hull (the first time on a machine its kernels are compiled: 10 to 30 s)")
+        log.info("carving the hull (its kernels are compiled once per machine, which takes 10 to 30 s)")
         silhouettes = gather_silhouettes(cameras, masks, self.dilate_px)
         settings = self
         if self.k == "auto" and self.kind != "released-go":

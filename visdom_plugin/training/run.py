@@ -49,7 +49,7 @@ DataManager = Callable[[Views, int, torch.device], Batches]
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal stopped the run; the same command goes on from the last step saved."""
+    """A signal stopped the run; the same command resumes it from the last step saved."""
 
 
 def train(
@@ -83,7 +83,7 @@ def train(
         CheckpointError: when `run_dir` belongs to another run or another process.
         EmptyHullError: when the config's hull is empty.
         TrainingError: when the optimisation diverges.
-        Interrupted: after Ctrl-C or SIGTERM; the same call goes on from there.
+        Interrupted: after Ctrl-C or SIGTERM; the same call resumes it.
     """
     preset = registry.find(preset_name)
     device = torch.device(device)

@@ -163,7 +163,7 @@ def test_a_method_without_variants_is_refused_with_those_that_have_them(variants
 def test_one_command_makes_table_and_figure_and_the_next_reuses_them(variants, capsys):
     assert table.main([*WORDS, "--views", "4"]) == 0
     said = capsys.readouterr()
-    assert "Paired ablation of fake" in said.out and "look at: t/ablation.png" in said.err
+    assert "Paired ablation of fake" in said.out and "figure: t/ablation.png" in said.err
     for name in ("table.md", "table.csv", "table.tex", "table.html"):
         assert Path("t", name).stat().st_size > 100
     runs = [json.loads(p.read_text()) for p in Path("t/runs").glob("*/run.json")]

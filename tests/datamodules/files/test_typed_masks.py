@@ -39,7 +39,7 @@ def test_names(tiny, folder, way):
     scene = load(folder)
     assert all(map(torch.equal, scene.train.masks, tiny.train.masks))
     assert all(map(torch.equal, scene.test.masks, tiny.test.masks))
-    assert describe_masks(scene.train) == ["4 foreground masks: outside is known to be empty"]
+    assert describe_masks(scene.train) == ["4 foreground masks; the background is known to be empty"]
 
 
 @pytest.mark.parametrize("factor", [2, 3])

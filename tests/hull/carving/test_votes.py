@@ -107,11 +107,11 @@ def test_agreement_on_the_edge_keeps():
 @pytest.mark.parametrize(
     ("views", "agreement", "words"),
     [
-        (4, 0.95, "not one miss"),
-        (9, 0.95, "not one miss"),
-        (20, 0.95, "one miss is"),
-        (4, 0.74, "one miss is"),
-        (40, 0.95, "2 misses"),
+        (4, 0.95, "masks of all of the views"),
+        (9, 0.95, "masks of all of the views"),
+        (20, 0.95, "all but one of"),
+        (4, 0.74, "all but one of"),
+        (40, 0.95, "all but 2 of"),
     ],
 )
 def test_rule_says_what_agreement_means(views, agreement, words):

@@ -227,7 +227,7 @@ def _table(report: dict[str, Any]) -> None:
     for line in summarise_fit(report):
         console.print(escape(line))
     if "out" in report:
-        console.print(f"look at {escape(report['out'])}/check.png")
+        console.print(f"sheet: {escape(report['out'])}/check.png")
 
 
 def summarise_fit(report: dict[str, Any]) -> list[str]:

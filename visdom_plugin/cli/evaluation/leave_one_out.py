@@ -250,7 +250,7 @@ def show_summary(summary: Summary, folder: Path) -> None:
     table.add_row("mean", *spell(summary["mean"]))
     table.add_row("worst", *spell({k: w and w["value"] for k, w in summary["worst"].items()}))
     console.print(table)
-    for label, name in (("look at", "leave_one_out.png"), ("numbers", "leave_one_out.json")):
+    for label, name in (("sheet", "leave_one_out.png"), ("numbers", "leave_one_out.json")):
         if (folder / name).exists():
             console.print(f"{label:>8}: {folder / name}", highlight=False, markup=False)
 

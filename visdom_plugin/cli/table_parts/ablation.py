@@ -251,4 +251,4 @@ def _draw(results: Results, views: int, photographs: Views, out: Path, quiet: bo
     path = out / (f"{NAME}-{views}.png" if several else f"{NAME}.png")
     write_png(path, draw_figure(results, views, photographs, VIEWS_SHOWN))
     if not quiet:
-        say(f"look at: {path}")
+        say(f"figure: {path}")

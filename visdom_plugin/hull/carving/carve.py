@@ -149,7 +149,7 @@ def _say_dropped(sizes: np.ndarray, keep: np.ndarray, policy: str, min_fraction:
     if keep.all():
         return ""
     why = {
-        "explain": "they explain no foreground that what is kept does not explain",
+        "explain": "the pieces kept cover the masks without them",
         "drop-small": f"below {min_fraction:g} of the largest piece's volume",
         "largest": "not the largest",
     }[policy]

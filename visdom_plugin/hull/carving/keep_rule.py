@@ -65,11 +65,11 @@ class KeepRule(NamedTuple):
         ]
         said = f"max_misses {self.max_misses}"
         if self.agreement is not None:
-            said = f"{float(self.agreement):g}"
+            said = f"agreement {float(self.agreement):g}"
         if not misses:
-            return f"{said} of at least {self.least_visible} views, but there are only {n}"
-        allowed = {0: "not one miss is", 1: "one miss is"}.get(misses[-1], f"{misses[-1]} misses are")
-        return f"{said} of up to {n} views: {allowed} allowed"
+            return f"{said} among at least {self.least_visible} views, but there are only {n}"
+        but = "" if misses[-1] == 0 else " but one" if misses[-1] == 1 else f" but {misses[-1]}"
+        return f"inside the masks of all{but} of the views that see it ({said}, {n} views)"
 
 
 def as_fraction(agreement: float) -> Fraction:

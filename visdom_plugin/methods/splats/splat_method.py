@@ -62,7 +62,7 @@ class SplatMethod(ABC, Generic[Config]):
             )
         self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
         if device.type == "cpu":
-            log.info("loading the CPU kernels (the first time on a machine they are compiled: 10 to 30 s)")
+            log.info("loading the CPU kernels (compiled once per machine, which takes 10 to 30 s)")
             warm_up()
         self.unit = float(mean_distance(views.cameras.to("cpu", torch.float64))) or 1.0
         self.virtual: VirtualViews | None = None

@@ -1,6 +1,6 @@
 """Runs a table: starts what is not done, judges what ended, writes the table whenever something changed.
 
-Everything is on disk and nothing in the driver: killed at any moment, the same command goes on. Several
+Everything is on disk and nothing in the driver: killed at any moment, it is resumed by the same command. Several
 drivers may work on one folder; a run belongs to whoever holds its directory, and the others wait for it.
 """
 
@@ -33,7 +33,7 @@ Writer = Callable[[Results], object]
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal stopped the table; the same command goes on."""
+    """A signal stopped the table; the same command resumes it."""
 
 
 @dataclass
