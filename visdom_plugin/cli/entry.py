@@ -63,7 +63,7 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
             print(BUG, file=sys.stderr)
             raise
         print(
-            f"error: {error}\n  what to do: make room or choose another place, then run it again",
+            f"error: {error}\n  what to do: free disk space or choose another location, then repeat the command",
             file=sys.stderr,
         )
         return USER_ERROR

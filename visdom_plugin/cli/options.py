@@ -37,25 +37,25 @@ class Reading:
     """Options of every command that opens a scene on disk."""
 
     data_format: DataFormat | None = None
-    """How the scene lies on disk; by default recognised."""
+    """Layout of the scene's folder; detected by default."""
     train_list: str | None = None
-    """Training views by hand in place of --views: an index file, positions and names with commas, or all."""
+    """Training views to use in place of --views: an index file, comma-separated positions and names, or all."""
     test_list: str | None = None
-    """Test views by hand, in the same way."""
+    """Test views, in the same way."""
     split: str | None = None
-    """A published split by name: visdom. With :SCENE where the folder is not named after the data set's scene."""
+    """A published split: visdom, or visdom:SCENE where the folder is not named after the data set's scene."""
     frame: int | None = None
-    """Which frame of a video layout (ActorsHQ); by default the first there is."""
+    """Frame of a video layout (ActorsHQ); by default the first one present."""
     masks: str | None = None
-    """Folder of the foreground masks, below the scene's; by default masks, or one that is called alike."""
+    """Folder of the foreground masks, inside the scene's; by default masks, or one with a similar name."""
     colmap_model: str | None = None
-    """Folder of the COLMAP model, such as sparse/1; by default, of several, the one with most photographs."""
+    """Folder of the COLMAP model, such as sparse/1; by default the one with the most registered photographs."""
     invert_masks: bool = False
-    """The masks are black on the object: turn them over."""
+    """Invert masks that are black on the object."""
     mask_path: Literal["ignore", "foreground"] = "ignore"
-    """What mask_path in a transforms.json names: black is to be ignored (nerfstudio), or white is the object."""
+    """Meaning of mask_path in a transforms.json: black pixels are ignored (nerfstudio), or white is the object."""
     allow_outside: bool = False
-    """Read files outside the scene's folder when the scene names them."""
+    """Allow the scene to name files outside its folder."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,11 @@ class SceneOptions(Reading):
     """Options of every command that reads training views."""
 
     data: Path | None = None
-    """Folder of the scene; without it, the built-in scene."""
+    """Folder of the scene; by default the built-in, procedural scene."""
     views: int = 4
-    """Training views; all train where the scene has no more."""
+    """Number of training views; a scene that has no more trains on all of them."""
     downscale: float = 1.0
-    """Work on images smaller by this factor."""
+    """Factor to downscale images by."""
     missing_masks: Annotated[Literal["error", "colour", "hull"], tyro.conf.arg(name="data.missing-masks")] = (
         "error"
     )
@@ -79,7 +79,7 @@ class SceneOptions(Reading):
     )
     """Where masks are read: their folder, the photographs' alpha channel, or whichever there is."""
     seed: int = 0
-    """Start of all random numbers."""
+    """Random seed."""
     quiet: bool = False
     """Print nothing but errors."""
 
@@ -89,7 +89,7 @@ class FolderOptions(SceneOptions):
     """Options of the commands that take the scene as a word of its own, too."""
 
     folder: tyro.conf.Positional[Path | None] = None
-    """Folder of the scene; without it, the built-in scene."""
+    """Folder of the scene; by default the built-in, procedural scene."""
 
     @property
     def scene_folder(self) -> Path | None:
@@ -108,21 +108,21 @@ class Common(FolderOptions):
     """Options of every training run."""
 
     device: Device = "auto"
-    """Where to compute; auto takes CUDA where there is one."""
+    """Device to compute on; auto takes CUDA where available."""
     budget: Literal["auto", "quick", "standard", "full"] = "auto"
     """quick: a minute or two on two CPU cores; standard: up to ten, for methods that have such settings; full: the
     published schedule; auto: quick on CPU, full on CUDA."""
     out: Path | None = None
     """Run directory; by default runs/<scene>/<views>/<method>/<seed>."""
     overwrite: bool = False
-    """Throw away another run that is in the run directory, or this one if it is finished or has failed. If it was
-    interrupted, it goes on all the same."""
+    """Discard the run in the run directory: another run, or this one if it has finished or failed. This run, if it
+    was interrupted, is resumed all the same."""
     checkpoint_seconds: float = 30.0
-    """Seconds between two checkpoints; results do not depend on it."""
+    """Seconds between checkpoints; results do not depend on it."""
     config: Path | None = None
     """YAML file with settings, as --show-config prints them."""
     show_config: bool = False
-    """Print all settings as YAML and stop; no training."""
+    """Print all settings as YAML and exit."""
 
 
 SAVED = ("data", *READING, "device", "budget")

@@ -31,12 +31,12 @@ class Options(FolderOptions):
 
     Finds masks that are inverted, empty, full, cut off, speckled, doubled or of the wrong size; poses with wrong
     axes; photographs in the wrong order; wrong focal lengths; the view that does not fit the others; views from
-    too similar directions; and tells the K that the views allow. Exits with 0 when nothing is wrong, 1 with
+    too similar directions; and advises K. Exits with 0 when nothing is wrong, 1 with
     findings, 2 when the scene cannot be read.
     """
 
     k: Annotated[int | Literal["auto"], tyro.conf.arg(aliases=["-k"])] = "auto"
-    """The K you are going to use; auto has one advised."""
+    """K that you will train with; auto has the check advise one."""
     out: Path | None = None
     """Folder for the contact sheet (check.png) and the report (check.json)."""
     json: bool = False
@@ -235,8 +235,8 @@ def summarise_fit(report: dict[str, Any]) -> list[str]:
     lines = [report["k_why"]] if "k_why" in report else []
     if "misfit" in report:
         lines.append(
-            f"Mean mask/camera mismatch: {report['misfit']:.2%} of the object's size. A ray beside a mask misses "
-            f"the other masks by {report['constraint']:.1%} in the mean: the more, the tighter the hull."
+            f"Mean mask/camera mismatch: {report['misfit']:.2%} of the object's size. Rays just outside one mask "
+            f"pass the other masks at {report['constraint']:.1%} of it on average; the farther, the tighter the hull."
         )
     return lines
 

@@ -18,16 +18,17 @@ from visdom_plugin.cli.early import read_early
 class Options:
     """Renders the test views of a run from its last checkpoint and measures them again.
 
-    With --leave-one-out in place of a run it takes a method and the options of visdom-train, and measures on each
-    training view what was made without it: visdom-eval --leave-one-out method:3dgs-go+vd --data DIR --views 4
+    With --leave-one-out in place of a run it takes a method and the options of visdom-train, and measures it
+    on each training view in turn, trained without that view:
+    visdom-eval --leave-one-out method:3dgs-go+vd --data DIR --views 4
     """
 
     run: tyro.conf.Positional[Path]
     """Run directory, as visdom-train names it."""
     data: Path | None = None
-    """Where the scene is now, if it has moved."""
+    """Folder of the scene, if it has moved."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute."""
+    """Device to compute on."""
     quiet: bool = False
     """Print nothing but errors."""
 

@@ -34,7 +34,7 @@ class Options(SceneOptions):
     """Exports a run, or any file of Gaussians, to the formats that other programs open.
 
     ply, spz, splat, sog: Gaussians. html: one page that shows them, without a server. glb, obj, and ply with
-    --mesh: a mesh with vertex colours, of every method. dataset: pictures without background, masks, and the
+    --mesh: a mesh with vertex colours, of any method. dataset: pictures without background, masks, and the
     cameras as transforms.json and COLMAP model, with the hull, for LichtFeld, Brush, nerfstudio, 3DGS; a folder
     with a scene will do. Without --format, what the method itself exports, again.
 
@@ -48,11 +48,11 @@ class Options(SceneOptions):
     out: Path | None = None
     """File or folder to write; by default in <run>/export/, and for NAME.ply beside it."""
     mesh: bool = False
-    """The ply is to hold a mesh, not Gaussians."""
+    """Write a mesh into the .ply, not Gaussians."""
     crop: Literal["none", "hull"] = "none"
-    """Leave out what lies more than a voxel outside the hull."""
+    """Remove what lies more than a voxel outside the hull."""
     upright: bool = False
-    """Put the object's middle at the origin and upright, as the programs that open the format expect it."""
+    """Centre the object at the origin and turn it upright, by the axis convention of the format."""
     info: bool = False
     """Print what a file of Gaussians holds, and write nothing."""
     surface: Literal["depth", "density"] = "depth"

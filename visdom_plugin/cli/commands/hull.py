@@ -35,7 +35,7 @@ class Options(FolderOptions, HullSettings):
     k: Annotated[int | Literal["n-1", "auto"], tyro.conf.arg(aliases=["-k"])] = HullSettings.k
     """K, the fewest views that must see a voxel. n-1: all but one. auto: 3, or 2 where 3 loses more of a mask."""
     inside: bool = False
-    """Report and write the smoothest full shape inside the hull that covers as much of the masks, not the hull."""
+    """Report and write, in place of the hull, the smoothest shape inside it that covers the masks as well."""
     out: Path | None = None
     """File to write: .ply for the mesh, .npz for the grid."""
     masks_out: Path | None = None
@@ -45,11 +45,11 @@ class Options(FolderOptions, HullSettings):
     frames: int = 60
     """Cameras on the circle."""
     overwrite: bool = False
-    """Let --masks-out replace files."""
+    """Let --masks-out overwrite files."""
     json: bool = False
     """Print one JSON object instead of the table."""
     diagnose: bool = False
-    """Ask the check what is wrong, as visdom-check does, and name masks that the hull leaves uncovered."""
+    """Report what visdom-check finds, and masks that the hull leaves uncovered."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

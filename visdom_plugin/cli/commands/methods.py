@@ -12,10 +12,10 @@ from visdom_plugin.cli import entry
 
 @dataclass(frozen=True)
 class Options:
-    """Lists the methods that visdom-train knows."""
+    """List the methods that visdom-train can train."""
 
     doctor: bool = False
-    """Also show which libraries and devices are found, and plugins that were skipped."""
+    """Also list libraries and devices found, and plugins that were skipped."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -34,18 +34,18 @@ class Options(SceneOptions):
     path: Literal["orbit", "between", "train", "test"] = "orbit"
     """orbit: a circle round the object; between: from training view to training view; train, test: these views."""
     frames: int = 60
-    """Pictures along orbit and between."""
+    """Number of frames along orbit and between."""
     fps: int = 30
-    """Pictures per second of the video."""
+    """Frames per second of the video."""
     format: Literal["mp4", "png"] = "mp4"
-    """A video, or a folder of numbered pictures."""
+    """A video, or a folder of numbered images."""
     out: Path | None = None
     """File or folder to write; by default <run>/renders/<path>.mp4 or <run>/renders/<path>_frames/, and for
     NAME.ply NAME_<path>.mp4 or NAME_<path>_frames/ beside it."""
     data: Path | None = None
-    """Folder of the scene. A run knows its own: say where it is if it has moved."""
+    """Folder of the scene; for a run, only where its scene has moved."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

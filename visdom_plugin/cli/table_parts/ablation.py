@@ -63,7 +63,7 @@ class AblationOptions(TableOptions):
     set: tuple[str, ...] = ()
     """Settings of all variants, as PATH=VALUE, e.g. steps=400 hull.resolution=128."""
     leave_one_out: bool = False
-    """Measure on each training view what was made without it, for scenes without test views."""
+    """For scenes without test views: hold out each training view in turn and measure on it."""
 
 
 def ablation(argv: Sequence[str]) -> int:

@@ -26,8 +26,8 @@ FAILURES = 1
 class TableOptions:
     """Run a table: every row (method) on every scene and number of views of every column, once per seed.
 
-    Finished runs are reused, interrupted ones go on, failed ones keep their error in the table and do not stop the
-    rest. Writes table.md, .csv, .tex and .html whenever a run ends. Exits with 1 when runs failed.
+    Finished runs are reused, interrupted ones resumed; failed ones show their error in the table and do not stop
+    the rest. Writes table.md, .csv, .tex and .html whenever a run ends. Exits with 1 when runs failed.
 
     The table `ablation` is made for one method and your scene: visdom-table ablation method:ingp --data DIR
     """
@@ -43,7 +43,7 @@ class TableOptions:
     """Folder of run directories; by default `runs` in the table's folder. Tables with the same one share
     their runs."""
     root: tuple[str, ...] = ()
-    """Where data lie, as NAME=DIR for each root the table names; or set VISDOM_ROOT_<NAME>."""
+    """Data roots as NAME=DIR, for each root the table names; or set VISDOM_ROOT_<NAME>."""
     data: Path | None = None
     """Run the rows on this scene in place of the table's columns."""
     views: tuple[int, ...] = ()
@@ -53,21 +53,21 @@ class TableOptions:
     seeds: tuple[int, ...] = ()
     """In place of the table's."""
     only: tuple[str, ...] = ()
-    """Labels of the rows to run; the others show what there is."""
+    """Labels of the rows to run; other rows show results that exist already."""
     budget: Literal["auto", "quick", "standard", "full"] | None = None
     """In place of the table's."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute; auto takes CUDA where there is one."""
+    """Device to compute on; auto takes CUDA where available."""
     executor: Literal["process", "local", "slurm"] | None = None
     """This process; `--workers` processes of this machine (the default with --workers); or a Slurm cluster."""
     workers: int | None = None
-    """Runs at a time on this machine; its cores are divided among them."""
+    """Number of runs at a time on this machine, which share its cores."""
     slurm: Path | None = None
     """YAML file of Slurm's resources; its entries win over the table's `slurm:`."""
     retry: bool = False
-    """Try failed runs again."""
+    """Retry failed runs."""
     dry_run: bool = False
-    """List the runs and what is there already, and stop."""
+    """List the runs and which of them are done, and exit."""
     quiet: bool = False
     """Print nothing but errors."""
 
@@ -120,7 +120,7 @@ def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | Non
             sys.stdout.write(markdown.read_text(encoding="utf-8"))
         if failed:
             say(
-                f"{failed} of {len(results.outcomes)} runs failed; the same command with --retry tries them again"
+                f"{failed} of {len(results.outcomes)} runs failed; add --retry to the command to run them again"
             )
         for path in sorted(folder.glob("table*.*")):
             say(f"written: {path}")

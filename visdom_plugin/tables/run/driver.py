@@ -226,7 +226,7 @@ def _judge(entry: _Watched, ended: Ended) -> Outcome:
     return Outcome("failed", error=error)
 
 
-_LOST = f"the process was lost {CHANCES} times without a word and without getting a step further"
+_LOST = f"the process disappeared {CHANCES} times without an exit status and without getting a step further"
 
 
 def _changes(known: dict[Path, Outcome]) -> dict[str, list[str]]:

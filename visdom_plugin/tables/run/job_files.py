@@ -128,8 +128,8 @@ def explain_exit(code: int, said: str) -> str:
             name = signal.Signals(-code).name
         except ValueError:
             name = f"signal {-code}"
-        hint = ", maybe for want of memory" if name == "SIGKILL" else ""
-        return f"the process was ended from outside ({name}{hint})"
+        hint = ", perhaps for lack of memory" if name == "SIGKILL" else ""
+        return f"the process was killed by another one ({name}{hint})"
     lines = said.strip().splitlines()
     starts = [i for i, line in enumerate(lines) if line.startswith("error: ")]
     if starts:
