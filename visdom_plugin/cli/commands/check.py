@@ -236,7 +236,7 @@ def summarise_fit(report: dict[str, Any]) -> list[str]:
     if "misfit" in report:
         lines.append(
             f"Mean mask/camera mismatch: {report['misfit']:.2%} of the object's size. Rays just outside one mask "
-            f"pass the other masks at {report['constraint']:.1%} of it on average; the farther, the tighter the hull."
+            f"pass the other masks at {report['constraint']:.1%} of it on average (farther: a tighter hull)."
         )
     return lines
 

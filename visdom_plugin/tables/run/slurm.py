@@ -167,7 +167,7 @@ class Slurm(Executor):
         if self._active:
             names = ",".join(sorted({name for _, (name, _) in self._active.values()}))
             log.warning(
-                "%d runs stay on the cluster; repeat the command to follow them, or cancel them with `scancel --name=%s`",
+                "%d runs stay on the cluster; repeat the command to follow them, `scancel --name=%s` cancels them",
                 len(self._active),
                 names,
             )
