@@ -51,7 +51,8 @@ def warm_up() -> None:
     from visdom_plugin.ssim import ssim
 
     eye = torch.eye(4, dtype=torch.float64)
-    camera = Cameras.from_matrices(torch.diag(eye.new_tensor([16, 16, 1])), eye, width=16, height=16)
+    k = eye.new_tensor([[16, 0, 8], [0, 16, 8], [0, 0, 1]])
+    camera = Cameras.from_matrices(k, eye, width=16, height=16)
     shapes = ((1, 3), (1, 3), (1, 4), (1,), (1, 16, 3))
     gaussians = Gaussians(*(torch.ones(shape, requires_grad=True) for shape in shapes))
     render = rasterise_cpu(gaussians, camera, torch.ones(3), 3, 0.01)
