@@ -96,7 +96,7 @@ def train(
         "config": as_plain(config),
         "data": describe_data(scene, request or {}),
     }
-    defaults = as_plain(getattr(preset, budget or "quick"))
+    defaults = as_plain(preset.settings(budget or "quick"))
     with RunDir.open(run_dir, finite(identity), overwrite=overwrite, defaults=defaults) as run:
         if run.record["status"] == "finished":
             return run.record | {"resumed_from": None, "already_finished": True}
