@@ -102,7 +102,7 @@ def test_show_config_round_trips(tmp_path, name, budget, steps, lr, views):
         ("settings: {inner: {w: 3}}", r"'settings.inner.w'[\s\S]*settings.inner: weight"),
         ("settings: {lr: soon}", "settings.lr cannot be 'soon'"),
         ("views: four", "views cannot be 'four'"),
-        ("budget: huge", r"budget cannot be 'huge'[\s\S]*'auto', 'quick', 'full'"),
+        ("budget: huge", r"budget cannot be 'huge'[\s\S]*'auto', 'quick', 'standard', 'full'"),
         ("method: fake+fast", "is for method:fake\\+fast, the command line says method:fake"),
         ("method: nothing", "no method 'nothing'"),
         ("[1, 2]", "holds list"),
@@ -131,7 +131,7 @@ def test_a_missing_or_unreadable_file_is_said(tmp_path):
     ("words", "says"),
     [
         ([], r"no method is named[\s\S]*visdom-train method:fake \| method:fake\+fast"),
-        (["fake"], r"named with method: before it[\s\S]*visdom-train method:fake"),
+        (["--quiet", "fake"], r"named with method: before it[\s\S]*visdom-train method:fake"),
         (["method:fke"], r"no method 'fke'; did you mean 'fake'\?[\s\S]*method:fake, method:fake\+fast"),
         (["method:fake", "method:fake+fast"], "one method at a time"),
     ],

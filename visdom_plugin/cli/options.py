@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, cast, get_a
 
 import tyro
 
-from datamodules.recognise import FORMATS, find_folder
+from datamodules.recognise import FORMATS
 from visdom_plugin import registry
 from visdom_plugin.cli.early import WORD, Early, read_early
 from visdom_plugin.errors import ConfigError, unknown_name
@@ -195,8 +195,6 @@ def parse(
     )
     common = Common(**{f.name: getattr(parsed, f.name) for f in fields(Common)})
     common = replace(common, budget=budget, data=common.scene_folder, folder=None)
-    if common.data is not None:
-        find_folder(common.data)
     return Request(preset, parsed.method, common, note)
 
 

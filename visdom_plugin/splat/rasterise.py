@@ -21,7 +21,7 @@ def rasterise(
     *,
     sh_degree: int | None = None,
     backend: str = "auto",
-    near: float,
+    near: float | None = None,
 ) -> Render:
     """Draws Gaussians as one camera sees them, differentiable in every parameter and the background.
 
@@ -36,7 +36,8 @@ def rasterise(
         background: (3,) colour in the space of the Gaussians' colours.
         sh_degree: harmonics in use, at most the stored degree; None uses all.
         backend: "cpu", "gsplat" (CUDA), or "auto": by the device of the Gaussians.
-        near: Gaussians nearer than this camera z are not drawn, scene units; `NEAR` mean camera distances.
+        near: Gaussians nearer than this camera z are not drawn, scene units; None for a hundredth of the camera's
+            distance from their middle, which a GPU waits for.
 
     Returns:
         Render whose info holds means2d (N, 2) pixels, whose `.grad` after a backward pass is the gradient by the
@@ -67,6 +68,8 @@ def rasterise(
             f"backend {chosen!r} cannot draw Gaussians on device {gaussians.means.device}",
             todo='use backend="auto", or move the Gaussians with .to(device)',
         )
+    if near is None:
+        near = NEAR * float((gaussians.means.detach().mean(0) - camera.centres.to(gaussians.means)).norm())
     if chosen == "cpu":
         from visdom_plugin.splat.cpu.backend import rasterise_cpu as draw
     else:
