@@ -34,6 +34,7 @@ SHARED = {
     "densify_scale": 0.0,
     "prune_opacity": 1.0,
 }
+BOTH = {"dropout": 1.0, "virtual_weight": -1.0}
 OWN = {
     GsGoConfig: {
         "depth_weight": -1.0,
@@ -58,7 +59,7 @@ OWN = {
     },
 }
 WRONG = [
-    (kind, name, value) for kind, own in OWN.items() for name, value in (SHARED | own).items()
+    (kind, name, value) for kind, own in OWN.items() for name, value in (SHARED | BOTH | own).items()
 ]  # fmt: skip
 
 
@@ -72,7 +73,7 @@ def test_a_setting_out_of_range_is_named_with_its_range(kind, name, value):
 @pytest.mark.parametrize("kind", list(OWN))
 def test_every_number_has_a_range(kind):
     numbers = {f.name for f in fields(kind) if "int" in str(f.type) or "float" in str(f.type)}
-    assert numbers == set(SHARED) | set(OWN[kind])
+    assert numbers == set(SHARED) | set(BOTH) | set(OWN[kind])
     assert {f.name for f in fields(GaussianSetConfig)} - {"background"} == set(SHARED)
 
 
