@@ -267,8 +267,9 @@ def test_all_photographs_can_train_where_nothing_but_the_layout_sets_some_aside(
     names = [f"{i}.jpg" for i in range(count)]
     found = choose(tmp_path, names, Request(views=count, hold_out=False), every_eighth(range(count)))
     assert found.train == list(range(count)) and found.test == []
-    with pytest.raises(SceneError):
-        choose(tmp_path, names, Request(views=count), every_eighth(range(count)))
+    # Where no more views are there than are wanted, they do so without being asked.
+    assert choose(tmp_path, names, Request(views=count), every_eighth(range(count))) == found
+    assert 0 in choose(tmp_path, names, Request(views=1), every_eighth(range(count))).test
     # What an index file sets aside stays there.
     (tmp_path / "sparse_test.txt").write_text("1\n")
     found = choose(tmp_path, names, Request(views=2, hold_out=False), every_eighth(range(count)))

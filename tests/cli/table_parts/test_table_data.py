@@ -148,6 +148,7 @@ def test_what_a_reading_may_hold_reaches_the_run():
         "frame": 3,
         "masks": "outlines",
         "colmap_model": "sparse/1",
+        "invert_masks": True,
         "mask_path": "foreground",
         "allow_outside": True,
         "split": "visdom",
