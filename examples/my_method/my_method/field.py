@@ -54,5 +54,5 @@ class Field:
 
     def export(self, folder):
         density, colour = lambda x: self.look(x)[0], lambda x, _: self.look(x)[1]
-        mesh = common.mesh_density(density, colour, self.frame, self.radius)
-        return common.export_mesh(folder / "mesh.ply", mesh, self.origin)
+        mesh = common.mesh_density(density, colour, self.frame, self.radius, origin=self.origin)
+        return common.export_mesh(folder / "mesh.ply", mesh)
