@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import product
 
 from visdom_plugin.tables.measures import MEASURES, Measure, find_measure
 from visdom_plugin.tables.paper import find_number, load_numbers
 from visdom_plugin.tables.report.layout import MEAN, Layout, read_layout
 from visdom_plugin.tables.results import Job, Outcome, Results
 
+Place = tuple[int, int, int | str, str]
+"""Row, column, number of views or "mean", and measure."""
 _WORST_FIRST = ("not available", "no data", "failed", "running", "waiting", "not measured", "finished")
 
 
@@ -30,11 +33,11 @@ class SceneValue:
     scene: str
     seed: int
     measure: str
-    value: float | None
-    status: str
+    value: float | None = None
+    status: str = "waiting"
     """As the job's, or "not measured" where a finished run has no such number."""
-    error: str | None
-    job: Job | None
+    error: str | None = None
+    job: Job | None = None
     """None where the driver has none for this place."""
 
 
@@ -107,19 +110,19 @@ def summarise(results: Results) -> Summary:
         for job, outcome in results.outcomes.items()
     }
     cells, scenes = [], []
-    for r, row in enumerate(spec.rows):
-        for c, column in enumerate(spec.columns):
-            for measure in measures:
-                parts = []
-                for views in column.views:
-                    values = list(_values_of(jobs, (r, c, views), column.scenes, spec.seeds, measure))
-                    scenes += values
-                    number = find_number(numbers, row.paper, column.paper, views, measure.paper)
-                    parts.append(_average(values, r, c, views, measure, number))
-                cells += parts
-                if len(parts) > 1 and layout.mean:
-                    number = find_number(numbers, row.paper, column.paper, MEAN, measure.paper)
-                    cells.append(_average_views(parts, number))
+    for (r, row), (c, column), measure in product(enumerate(spec.rows), enumerate(spec.columns), measures):
+        paper = partial(find_number, numbers, row.paper, column.paper, metric=measure.paper)
+        parts = []
+        for views in column.views:
+            values = []
+            for scene, seed in product(column.scenes, spec.seeds):
+                value = SceneValue(r, c, views, scene, seed, measure.name)
+                values.append(_read(value, jobs.get((r, c, views, scene, seed)), measure))
+            scenes += values
+            parts.append(_average((r, c, views, measure.name), values, paper(views)))
+        cells += parts
+        if len(parts) > 1 and layout.mean:
+            cells.append(_average_views((r, c, MEAN, measure.name), parts, paper(MEAN)))
     if layout.best != "none":
         groups = [row.group if layout.best == "group" else "" for row in spec.rows]
         cells = rank_cells(cells, groups)
@@ -169,61 +172,44 @@ def _is_better(x: float, y: float, measure: str) -> bool:
     return x > y if MEASURES[measure].higher_is_better else x < y
 
 
-def _values_of(jobs, place, scenes, seeds, measure: Measure) -> Iterable[SceneValue]:
-    wanted = [(scene, seed) for scene in scenes for seed in seeds]
-    for scene, seed in wanted:
-        job, outcome = jobs.get((*place, scene, seed), (None, None))
-        status, error, value = "waiting", None, None
-        if outcome is not None:
-            status, error = outcome.status, outcome.error
-            value = measure.read(outcome.record) if status == "finished" else None
-        if status == "finished" and value is None:
-            status = "not measured"
-        row, column, views = place
-        yield SceneValue(row, column, views, scene, seed, measure.name, value, status, error, job)
+def _read(place: SceneValue, found: tuple[Job, Outcome] | None, measure: Measure) -> SceneValue:
+    if found is None:
+        return place
+    job, outcome = found
+    finished = outcome.status == "finished"
+    value = measure.read(outcome.record) if finished else None
+    status = "not measured" if finished and value is None else outcome.status
+    return replace(place, value=value, status=status, error=outcome.error, job=job)
 
 
-def _average(values: list[SceneValue], r: int, c: int, views, measure: Measure, paper: float | None) -> Cell:
+def _average(place: Place, values: list[SceneValue], paper: float | None) -> Cell:
     by_seed: dict[int, list[float]] = {}
     for v in values:
         if v.value is not None:
             by_seed.setdefault(v.seed, []).append(v.value)
-    seeds = tuple((seed, _mean(found)) for seed, found in sorted(by_seed.items()))
+    seeds = {seed: _mean(found) for seed, found in sorted(by_seed.items())}
     n = sum(map(len, by_seed.values()))
-    return _close(r, c, views, measure.name, n, len(values), seeds, paper, [v.status for v in values])
+    return _close(place, n, len(values), seeds, paper, [v.status for v in values])
 
 
-def _average_views(parts: list[Cell], paper: float | None) -> Cell:
+def _average_views(place: Place, parts: list[Cell], paper: float | None) -> Cell:
     """The mean over numbers of views, seed by seed; seeds that a number of views lacks count for nothing."""
-    first = parts[0]
     by_seed = [dict(p.seeds) for p in parts]
     common = sorted(set.intersection(*map(set, by_seed)))
-    seeds = tuple((seed, _mean([part[seed] for part in by_seed])) for seed in common)
+    seeds = {seed: _mean([part[seed] for part in by_seed]) for seed in common}
     n, of = sum(p.n for p in parts), sum(p.of for p in parts)
-    return _close(
-        first.row, first.column, MEAN, first.measure, n, of, seeds, paper, [p.status for p in parts]
-    )
+    return _close(place, n, of, seeds, paper, [p.status for p in parts])
 
 
-def _close(r, c, views, measure, n, of, seeds, paper, statuses) -> Cell:
-    means = [mean for _, mean in seeds]
-    mean = _mean(means) if means else None
-    whole = n == of and n > 0
+def _close(
+    place: Place, n: int, of: int, seeds: dict[int, float], paper: float | None, statuses: Sequence[str]
+) -> Cell:
+    means = list(seeds.values())
+    mean, whole = _mean(means) if means else None, n == of and n > 0
+    std = sample_std(means) if whole else None
+    difference = None if mean is None or paper is None or not whole else mean - paper
     status = min(statuses, key=_WORST_FIRST.index) if statuses else "waiting"
-    return Cell(
-        row=r,
-        column=c,
-        views=views,
-        measure=measure,
-        n=n,
-        of=of,
-        mean=mean,
-        std=sample_std(means) if whole else None,
-        seeds=seeds,
-        paper=paper,
-        difference=mean - paper if whole and paper is not None else None,
-        status=status,
-    )
+    return Cell(*place, n, of, mean, std, tuple(seeds.items()), paper, difference, status)
 
 
 def _mean(values: Sequence[float]) -> float:
