@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, unknown_name
 from visdom_plugin.tables.results import Results
 from visdom_plugin.tables.spec import Column, TableSpec, check_spec
 
@@ -136,7 +136,7 @@ def find_rows(spec: TableSpec, labels: Sequence[str]) -> list[int] | None:
     known = [row.label for row in spec.rows]
     for label in labels:
         if label not in known:
-            raise ConfigError(f"there is no row {label!r}", where="--only", todo=f"rows: {', '.join(known)}")
+            raise unknown_name(f"there is no row {label!r}", label, known, where="--only", todo="rows")
     return [known.index(label) for label in labels] or None
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from visdom_plugin.cli.options import READING, Common, resolve_lists
-from visdom_plugin.errors import ConfigError, SceneError
+from visdom_plugin.errors import ConfigError, SceneError, unknown_name
 from visdom_plugin.tables.spec import Settings
 from visdom_plugin.training.runs.config_io import from_plain
 
@@ -28,11 +28,13 @@ def tidy_reading(reading: Settings, where: str) -> Settings:
     valid = [name for name in READING if name not in OWN]
     for name in reading:
         if name not in valid:
-            raise ConfigError(
+            raise unknown_name(
                 f"reading cannot hold {name!r}",
+                name,
+                valid,
                 where=where,
                 cause="a table has its own place for it" if name in OWN else None,
-                todo=f"valid names in reading: {', '.join(valid)}",
+                todo="valid names in reading",
             )
     checked = from_plain(Common(), dict(reading), where, "reading")
     return resolve_lists({name: getattr(checked, name) for name in reading})
