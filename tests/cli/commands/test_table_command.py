@@ -149,7 +149,7 @@ def test_a_dry_run_writes_nothing(small, tmp_path, capsys):
         (["small.yaml", "--budget", "auto", "--executor", "slurm"], "budget"),
         (["small.yaml", "--out", "small.yaml/t"], "small.yaml is a file"),
         (["small.yaml", "--runs", "small.yaml"], "choose another --runs"),
-        (["small.yaml", "--out", "t" * 300], "choose another place"),
+        (["small.yaml", "--out", "t" * 300], "choose another location"),
         (["small.yaml", "--views", "0"], "1 or more"),
         (["small.yaml", "--views", "4", "4"], "different values, not 4, 4"),
         (["small.yaml", "--downscale", "0"], "1 or more"),
