@@ -121,6 +121,8 @@ class Common(FolderOptions):
     """Seconds between checkpoints; results do not depend on it."""
     config: Path | None = None
     """YAML file with settings, as --show-config prints them."""
+    report: bool = True
+    """End with report.html in the run directory, one page that shows what came out."""
     show_config: bool = False
     """Print all settings as YAML and exit."""
 

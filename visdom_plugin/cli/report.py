@@ -60,6 +60,7 @@ def show_result(record: dict[str, Any], folder: Path) -> None:
     for name, count in record.get("model", {}).items():
         console.print(f"model: {count:,} {name.capitalize()}", highlight=False)
     for label, name in (
+        ("report", "report.html"),
         ("sheet", "renders/test_sheet.png"),
         ("sheet", "renders/training_sheet.png"),
         ("orbit", "renders/orbit_sheet.png"),

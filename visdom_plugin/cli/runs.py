@@ -5,15 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from visdom_plugin.cli import options
 from visdom_plugin.cli.scenes import make_data_manager, open_scene
 from visdom_plugin.errors import CheckpointError, ConfigError
 from visdom_plugin.scene import Scene, hold_out
 
+if TYPE_CHECKING:
+    from visdom_plugin.training.run import OnFinished
 
-def train_as_asked(request: options.Request, scene, run_dir: Path, device: str) -> dict[str, Any]:
+
+def train_as_asked(
+    request: options.Request, scene, run_dir: Path, device: str, on_finished: OnFinished | None = None
+) -> dict[str, Any]:
     """`training.run.train` with what the command line says; run.json's content."""
     from visdom_plugin.training.run import train
 
@@ -31,6 +36,7 @@ def train_as_asked(request: options.Request, scene, run_dir: Path, device: str) 
         checkpoint_seconds=common.checkpoint_seconds,
         budget=common.budget,
         request=options.describe_reading(common),
+        on_finished=on_finished,
     )
 
 

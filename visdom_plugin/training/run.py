@@ -48,6 +48,10 @@ DataManager = Callable[[Views, int, torch.device], Batches]
 """(training views, seed, device) to the batches."""
 
 
+OnFinished = Callable[[Record, Method, "Hull | None"], None]
+"""What is done with a run that has just finished: its record, its method and the method's hull."""
+
+
 class Interrupted(KeyboardInterrupt):
     """A signal stopped the run; the same command resumes it from the last step saved."""
 
@@ -66,6 +70,7 @@ def train(
     checkpoint_seconds: float = 30,
     request: Record | None = None,
     budget: str | None = None,
+    on_finished: OnFinished | None = None,
 ) -> Record:
     """Trains, evaluates and writes the run directory; resumes the same run where it was left.
 
@@ -75,6 +80,8 @@ def train(
         preset_name: names the method's class; its settings are `config`.
         request: how the scene was asked for, so that it can be loaded again: path, seed, views, downscale.
         budget: noted in run.json.
+        on_finished: called at the end of a run that this call finishes; what it raises is logged, no
+            more.
 
     Returns:
         run.json's content, with `resumed_from` (step, or None) and `already_finished` added.
@@ -108,7 +115,9 @@ def train(
         _warn_of_changes(run.record, circumstances)
         run.update(status="running", budget=budget, **circumstances)
         try:
-            resumed = _run(preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds)
+            resumed, method, hull = _run(
+                preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds
+            )
         except KeyboardInterrupt:
             run.update(status="interrupted")
             raise Interrupted from None
@@ -119,6 +128,11 @@ def train(
         except BaseException as error:
             run.update(status="failed", error=f"{type(error).__name__}: {error}")
             raise
+        if on_finished is not None:
+            try:
+                on_finished(run.record, method, hull)
+            except Exception as error:
+                log.error("the run has finished, but not what was to follow: %r", error, exc_info=True)
         return run.record | {"resumed_from": resumed, "already_finished": False}
 
 
@@ -132,7 +146,8 @@ def _run(
     seed: int,
     quiet: bool,
     checkpoint_seconds: float,
-) -> int | None:
+) -> tuple[int | None, Method, Hull | None]:
+    """Where it went on from, and what was trained."""
     saved = run.path / "hull"
     method, hull, hull_s = build(preset, config, scene.train, device=device, seed=seed, saved=saved)
     if hull is not None:
@@ -165,7 +180,7 @@ def _run(
         metrics=finite(found),
         model=summarise(method),
     )
-    return trainer.resumed_from
+    return trainer.resumed_from, method, hull
 
 
 def choose_batches(method: Method, batches: Batches) -> Callable[[int], Batch]:

@@ -116,6 +116,13 @@ def _advise(finding: Finding, views: int, inverted: bool) -> str:
     return "leave out --invert-masks" if inverted else f"{finding.todo}; or pass --invert-masks"
 
 
+def find_briefly(scene: Scene) -> list[dict[str, Any]]:
+    """What the brief check finds, as `describe_check` spells it."""
+    views, masks = carving_views(scene.train)
+    found = check_views(views, masks, brief=True, layout=scene.source.get("layout"))
+    return describe_check(found, views.names)["findings"]
+
+
 def carving_views(views: Views) -> tuple[Views, list]:
     """The views whose masks were given, and these masks with ignored pixels as foreground."""
     from visdom_plugin.scene import Views

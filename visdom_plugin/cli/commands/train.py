@@ -41,7 +41,15 @@ def _train(argv: Sequence[str]) -> None:
             say(f"data: {line}")
         say(f"run directory: {folder}")
     warn_of_faults(scene, inverted=common.invert_masks)
-    record = train_as_asked(request, scene, folder, device)
+    on_finished = None
+    if common.report:
+        from functools import partial
+
+        from visdom_plugin.cli.commands.check import find_briefly
+        from visdom_plugin.cli.reports import report_finished
+
+        on_finished = partial(report_finished, scene=scene, run_dir=folder, device=device, check=find_briefly)
+    record = train_as_asked(request, scene, folder, device, on_finished)
     if not common.quiet:
         if record["already_finished"]:
             say("this run is finished already; nothing was done (train again with --overwrite)")

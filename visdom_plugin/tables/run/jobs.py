@@ -251,7 +251,7 @@ def _make_task(
         "budget": found.budget,
         "settings": settings,
     }
-    argv = ("--config", str(beside(run_dir, ".yaml")), "--out", str(run_dir), "--quiet")
+    argv = ("--config", str(beside(run_dir, ".yaml")), "--out", str(run_dir), "--quiet", "--no-report")
     steps = settings.get("steps", 0) if isinstance(settings, dict) else 0
     label = f"{spec.rows[job.row].label}, {scene}, {job.views} views, seed {job.seed}"
     module = workshop.modules[spec.kind]
