@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
+from visdom_plugin.tables.measures import MEASURES
 
 ROWS = (
     ("psnr", "PSNR", "dB"),
@@ -17,9 +20,28 @@ ROWS = (
 )
 
 
+FILES = (
+    ("report", "report.html"),
+    ("sheet", "renders/test_sheet.png"),
+    ("sheet", "renders/training_sheet.png"),
+    ("orbit", "renders/orbit_sheet.png"),
+    ("renders", "renders/test"),
+    ("export", "export"),
+    ("hull", "hull/hull.ply"),
+    ("numbers", "run.json"),
+)
+
+
 def say(text: str) -> None:
     """One line for the user, on stderr so that stdout stays for results."""
     print(text, file=sys.stderr, flush=True)
+
+
+def show_files(folder: Path, named: Iterable[tuple[str, str]]) -> None:
+    """A line for each (label, file in the folder) that is there, on stdout."""
+    for label, name in named:
+        if (folder / name).exists():
+            print(f"{label:>8}: {folder / name}")
 
 
 def show_result(record: dict[str, Any], folder: Path) -> None:
@@ -41,7 +63,7 @@ def show_result(record: dict[str, Any], folder: Path) -> None:
         if means.get(key) is None:
             continue
         values = [row[key] for row in per_view.values() if row[key] is not None]
-        worst = max(values) if key in ("outside_hull_mass", "lpips") else min(values)
+        worst = min(values) if MEASURES[key].higher_is_better else max(values)
         digits = 2 if unit else 4
         table.add_row(
             label, f"{means[key]:.{digits}f} {unit}".rstrip(), f"{worst:.{digits}f} {unit}".rstrip()
@@ -59,15 +81,4 @@ def show_result(record: dict[str, Any], folder: Path) -> None:
         )
     for name, count in record.get("model", {}).items():
         console.print(f"model: {count:,} {name.capitalize()}", highlight=False)
-    for label, name in (
-        ("report", "report.html"),
-        ("sheet", "renders/test_sheet.png"),
-        ("sheet", "renders/training_sheet.png"),
-        ("orbit", "renders/orbit_sheet.png"),
-        ("renders", "renders/test"),
-        ("export", "export"),
-        ("hull", "hull/hull.ply"),
-        ("numbers", "run.json"),
-    ):
-        if (folder / name).exists():
-            console.print(f"{label:>8}: {folder / name}", highlight=False, markup=False)
+    show_files(folder, FILES)

@@ -167,7 +167,7 @@ def run_folds(request: options.Request, scene: Scene, folder: Path, *, device: s
     from visdom_plugin.atomic_files import write_json
     from visdom_plugin.cli.report import say
     from visdom_plugin.cli.runs import train_as_asked
-    from visdom_plugin.figures.contact_sheet import picture_names, write_png
+    from visdom_plugin.figures.contact_sheet import draw_sheet, picture_names, write_png
     from visdom_plugin.scene import hold_out
     from visdom_plugin.training.missing_masks import fill_masks
     from visdom_plugin.training.runs.config_io import as_plain
@@ -193,7 +193,7 @@ def run_folds(request: options.Request, scene: Scene, folder: Path, *, device: s
             continue
         columns.append(_column(fold, records[name], folder / names[i]))
     if columns:
-        write_png(folder / "leave_one_out.png", _draw(columns))
+        write_png(folder / "leave_one_out.png", draw_sheet(columns, ["truth", "render", "error"]))
     summary: Summary = {
         "method": request.preset.name,
         "scene": scene.name,
@@ -211,6 +211,7 @@ def run_folds(request: options.Request, scene: Scene, folder: Path, *, device: s
 
 def summarise(per_view: dict[str, dict[str, float | None]]) -> Averages:
     """Mean and worst view of each metric; None where no view has it."""
+    from visdom_plugin.tables.measures import MEASURES
     from visdom_plugin.training.metrics import NAMES
 
     mean: dict[str, float | None] = {}
@@ -218,7 +219,7 @@ def summarise(per_view: dict[str, dict[str, float | None]]) -> Averages:
     for name in NAMES:
         values = {view: value for view, row in per_view.items() if (value := row.get(name)) is not None}
         mean[name] = sum(values.values()) / len(values) if values else None
-        choose = max if name in ("outside_hull_mass", "lpips") else min
+        choose = min if MEASURES[name].higher_is_better else max
         view = choose(values, key=values.__getitem__) if values else None
         worst[name] = None if view is None else {"view": view, "value": values[view]}
     return {"mean": mean, "worst": worst, "per_view": per_view}
@@ -228,6 +229,8 @@ def show_summary(summary: Summary, folder: Path) -> None:
     """The table on the terminal."""
     from rich.console import Console
     from rich.table import Table
+
+    from visdom_plugin.cli.report import show_files
 
     console = Console(soft_wrap=True)
     shown = [column for column in COLUMNS if summary["mean"].get(column[0]) is not None] or COLUMNS[:1]
@@ -250,9 +253,7 @@ def show_summary(summary: Summary, folder: Path) -> None:
     table.add_row("mean", *spell(summary["mean"]))
     table.add_row("worst", *spell({k: w and w["value"] for k, w in summary["worst"].items()}))
     console.print(table)
-    for label, name in (("sheet", "leave_one_out.png"), ("numbers", "leave_one_out.json")):
-        if (folder / name).exists():
-            console.print(f"{label:>8}: {folder / name}", highlight=False, markup=False)
+    show_files(folder, (("sheet", "leave_one_out.png"), ("numbers", "leave_one_out.json")))
 
 
 def _column(fold: Scene, record: dict[str, Any], run_dir: Path) -> tuple[str, list[np.ndarray]]:
@@ -269,9 +270,3 @@ def _column(fold: Scene, record: dict[str, Any], run_dir: Path) -> tuple[str, li
         truth[ignored.numpy()], error[ignored.numpy()] = 128, 128
     psnr = record["metrics"]["per_view"][name]["psnr"]
     return f"{name}  {psnr:.1f} dB", [truth, render, error]
-
-
-def _draw(columns: list[tuple[str, list[np.ndarray]]]) -> np.ndarray:
-    from visdom_plugin.figures.contact_sheet import draw_sheet
-
-    return draw_sheet(columns, ["truth", "render", "error"])
