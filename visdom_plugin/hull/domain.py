@@ -52,19 +52,25 @@ class VisibleDomain(HullSettings):
 
         Raises:
             EmptyHullError: when nothing is left, with the cause where it could be established.
-            SceneError: when masks and cameras do not fit each other: in number or size, or, with automatic bounds,
-                because the hull covers little of the masks and would cover them with poses of another convention.
+            SceneError: when masks and cameras do not fit each other: in number or size; because all cameras stand
+                at one point; or, with automatic bounds, because the hull covers little of the masks, or is
+                degenerate, and would be sound with poses of another convention.
         """
         # Settings stand on every command line: torch and numba are loaded when a hull is carved, the check, which
         # needs OpenCV, when it is asked.
         from visdom_plugin.hull.carving.carve import carve_silhouettes
         from visdom_plugin.hull.carving.votes import gather_silhouettes
-        from visdom_plugin.hull.checks.coverage import explains_enough
+        from visdom_plugin.hull.checks.coverage import looks_sound
+        from visdom_plugin.hull.checks.degenerate import stand_at_one_point
         from visdom_plugin.hull.checks.mask_checks import look_inverted
         from visdom_plugin.hull.checks.wording import wording
 
         log.info("carving the hull (its kernels are compiled once per machine, which takes 10 to 30 s)")
         silhouettes = gather_silhouettes(cameras, masks, self.dilate_px)
+        if stand_at_one_point(cameras):
+            from visdom_plugin.hull.checks.explain_failure import explain_one_point
+
+            raise explain_one_point(self, cameras, silhouettes)
         settings = self
         if self.k == "auto" and self.kind != "released-go":
             from visdom_plugin.hull.checks.covisibility import advise_k
@@ -80,7 +86,7 @@ class VisibleDomain(HullSettings):
             raise explain_empty(settings, cameras, silhouettes)
         hull = replace(hull, summary=hull.summary | {"k_asked": self.k})
         misfit = None
-        if not explains_enough(settings, cameras, silhouettes, hull):
+        if not looks_sound(settings, cameras, silhouettes, hull):
             from visdom_plugin.hull.checks.explain_failure import find_misfit
 
             misfit = find_misfit(settings, cameras, silhouettes, hull)

@@ -20,6 +20,7 @@ from visdom_plugin.hull.checks.covisibility import (
     advise_k,
     measure_spread,
 )
+from visdom_plugin.hull.checks.degenerate import stand_at_one_point
 from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines, draw_outlines
 from visdom_plugin.hull.checks.fault_hypotheses import QUIET_PX, Suspicion, find_causes
 from visdom_plugin.hull.checks.findings import Finding, Name, Sure
@@ -110,6 +111,9 @@ def check(
     turned = {v for f in inverted for v in f.views}
     found += check_border([m if i not in turned else ~m for i, m in enumerate(own)], names)
     causes, fit, left = find_causes(outlines, brief=brief, poses=poses)
+    if stand_at_one_point(chosen) and not any(c.kind == "axes" for c in causes):
+        notes, found = _split([*found, *repeated, _one_point(len(chosen))])
+        return Check(found, notes, None, fit, tuple(usable.tolist()))
     astray = _astray(chosen)
     if astray and _views_alone(causes, fit):
         notes, found = _split([*found, *repeated, astray])
@@ -199,6 +203,18 @@ def _inverted(
         "invert them: white (True) on the object",
     )
     return [said], turned
+
+
+def _one_point(count: int) -> Finding:
+    return Finding(
+        "centres",
+        f"all {count} cameras stand at one point, from which nothing can be told of depth",
+        (),
+        "certain",
+        float(count),
+        "give each pose its camera's position; on a turntable, world-to-camera matrices taken for their inverses "
+        "look like this: invert them",
+    )
 
 
 def _astray(cameras: Cameras) -> Finding | None:

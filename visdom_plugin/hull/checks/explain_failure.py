@@ -1,8 +1,7 @@
 """Explanations of carves that fail: a hull that is empty, or one that leaves most of its masks uncovered.
 
 What is wrong with the data is asked of the check; a box or a ball that misses the hull is tried here. A hull
-carved with wrong poses is seldom empty: sound captures of two to nine views leave hulls that cover 96 % or more of
-the masks in the mean, world-to-camera matrices taken for their inverses chance meetings that cover 1 % to 52 %.
+carved with wrong poses is seldom empty: views meet by chance, on whatever scale.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from visdom_plugin.hull.carving.votes import Silhouettes
 from visdom_plugin.hull.checks.check import check
 from visdom_plugin.hull.checks.coverage import POOR_COVERAGE, measure_coverage
 from visdom_plugin.hull.checks.covisibility import LEAST_K, USUAL_K
+from visdom_plugin.hull.checks.degenerate import count_cameras_inside, describe_speck
 from visdom_plugin.hull.checks.findings import Finding, Name
 from visdom_plugin.hull.checks.wording import COMMANDS, wording
 from visdom_plugin.hull.hull import Hull
@@ -32,8 +32,6 @@ _COARSE = 64
 """Voxels per side of a trial hull."""
 _CONVINCING = 0.9
 """Mean share of the masks that a trial hull must cover."""
-_SPECK = 1e-3
-"""Of the cameras' distance: a hull smaller than this is no object that a camera was pointed at."""
 _SHOWN = 3
 _HARMLESS = ("border", "clustered", "few", "full")
 """Findings that empty no hull."""
@@ -41,6 +39,7 @@ _AFTER_SETTINGS = ("covisibility", "disagreement")
 """Findings that explain less than a box beside the hull does."""
 _WHERE = {
     "axes": "camera poses",
+    "centres": "camera poses",
     "scale": "camera intrinsics",
     "principal": "camera intrinsics",
     "covisibility": "k",
@@ -80,31 +79,42 @@ def explain_empty(settings: HullSettings, cameras: Cameras, silhouettes: Silhoue
     return EmptyHullError(what, where=_where(fault), cause=_cause(fault), todo=_todo(fault))
 
 
+def explain_one_point(settings: HullSettings, cameras: Cameras, silhouettes: Silhouettes) -> SceneError:
+    """The error for cameras that all stand at one point."""
+    fault = next(f for f in _faults(settings, cameras, silhouettes) if f.kind in ("axes", "centres"))
+    what = f"all {len(cameras)} cameras stand at one point, from which nothing can be told of depth"
+    cause = None if fault.kind == "centres" else _cause(fault)
+    return SceneError(what, where=_where(fault), cause=cause, todo=_todo(fault))
+
+
 def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouettes, hull: Hull) -> str | None:
-    """A sentence for the user when the hull leaves most of the masks uncovered, or None.
+    """A sentence for the user when a hull that does not look sound leaves most of the masks uncovered, or None.
 
     Raises:
         SceneError: when poses of another convention explain the masks, or the hull is a mere speck.
     """
     cameras = cameras.to("cpu", dtype=torch.float64)
-    covered = _mean_coverage(hull, cameras, silhouettes)
-    if covered >= POOR_COVERAGE:
-        return None
+    covered, speck = _mean_coverage(hull, cameras, silhouettes), describe_speck(cameras, hull)
+    inside = count_cameras_inside(KeepRule.of(settings, len(silhouettes)), cameras, hull)
     what = f"the hull does not explain the masks: it covers {covered:.0%} of them in the mean"
-    log.info("%s; looking for the cause", what)
+    if speck is not None:
+        what = f"{speck}, and covers {covered:.0%} of the masks in the mean"
+    elif inside and covered >= POOR_COVERAGE:
+        what = f"the hull reaches the cameras: {inside} of {len(cameras)} stand inside it"
+    log.info("the hull covers %.0f%% of the masks; looking for a cause", 100 * covered)
     fault = next(iter(_faults(settings, cameras, silhouettes)), None)
     if fault is not None and fault.kind == "axes" and fault.sure != "possible":
         raise SceneError(what, where=_where(fault), cause=_cause(fault), todo=_todo(fault))
-    size = np.ptp(hull.extent, axis=0).max()
-    distance = (cameras.centres - torch.from_numpy(hull.centre)).norm(dim=-1).median().item()
-    if size < _SPECK * distance:
+    if speck is not None:
         meeting = "poses or intrinsics that do not belong to these masks, so that views meet only by chance"
         raise SceneError(
-            f"{what}, and is a speck: {size:.2g} long, {distance:.2g} from the cameras",
+            what,
             where="camera poses" if fault is None else _where(fault),
             cause=meeting if fault is None else _cause(fault),
             todo=wording().look if fault is None else _todo(fault),
         )
+    if covered >= POOR_COVERAGE:
+        return None
     if fault is not None:
         return f"{what}; {_cause(fault)}; {_todo(fault)}"
     few = f", or too little is seen by K = {settings.k} views" if settings.kind == "visdom" else ""

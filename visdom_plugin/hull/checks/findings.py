@@ -15,7 +15,7 @@ class Finding(NamedTuple):
 
     kind: str
     """Machine-readable name: size, empty, full, border, speckled, inverted, duplicate, axes, order, swapped,
-    scale, principal, view, disagreement, clustered, covisibility, few."""
+    scale, principal, centres, view, disagreement, clustered, covisibility, few."""
     what: str
     """A sentence with the number behind it."""
     views: tuple[int, ...]
