@@ -331,3 +331,10 @@ def test_pieces_are_those_of_26_neighbours(seed, fill):
             assert left.sum() == sizes.max(initial=0) and not (left & ~allowed).any()
         else:
             assert np.array_equal(left, allowed)
+
+
+def test_a_hull_says_what_it_is_in_one_line():
+    hull = Hull.from_grid(np.ones((2, 3, 4)), [[0, 0, 0], [1, 1.5, 2]])
+    assert repr(hull) == "Hull(24 of 2x3x4 voxels, (0, 0, 0) .. (1, 1.5, 2))"
+    carved = Hull(hull.occupancy, hull.bounds, {"kind": "visdom", "views": 4, "k": 3, "seconds": 0.2})
+    assert repr(carved).endswith("(1, 1.5, 2), kind='visdom', views=4, k=3)")

@@ -90,7 +90,7 @@ def _hulls_of_others(
         return {}
     index = torch.tensor(usable)
     cameras = views.cameras[index]
-    domain = VisibleDomain(resolution=_RESOLUTION, k=1, components="largest")
+    domain = VisibleDomain(resolution=_RESOLUTION, k=1)
     k = 3 if found.advice is None else found.advice.k
     result = {}
     for view in range(len(views)):

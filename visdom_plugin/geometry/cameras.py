@@ -86,9 +86,9 @@ class Cameras:
             batch = torch.broadcast_shapes(intrinsics.shape[:-2], motion.shape[:-2])
         except RuntimeError as error:
             raise SceneError(
-                f"K is for cameras of shape {tuple(intrinsics.shape[:-2])}, "
+                f"the intrinsics are for cameras of shape {tuple(intrinsics.shape[:-2])}, "
                 f"world_from_camera for {tuple(motion.shape[:-2])}",
-                todo="pass one K per camera, or one (3, 3) for all",
+                todo="pass intrinsics (N, 3, 3), one per camera, or (3, 3) for all",
             ) from error
         size = _sizes(batch, motion.device, width=width, height=height)
         cameras = cls(intrinsics.expand(*batch, 3, 3), motion.expand(*batch, 4, 4), *size)

@@ -26,7 +26,7 @@ Points = np.ndarray | Sequence[float] | Sequence[Sequence[float]]
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Hull:
     """Voxels that may hold the object. Never changed after it is made: its arrays are read-only.
 
@@ -97,6 +97,12 @@ class Hull:
         return same and np.array_equal(self.occupancy, other.occupancy)
 
     __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        corners = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in self.bounds.tolist())
+        parts = [f"{self.voxels} of {'x'.join(map(str, self.shape))} voxels", " .. ".join(corners)]
+        parts += [f"{name}={self.summary[name]!r}" for name in ("kind", "views", "k") if name in self.summary]
+        return f"Hull({', '.join(parts)})"
 
     def relative_to(self, origin: np.ndarray | Sequence[float]) -> Hull:
         """The same hull in the frame that has its origin at `origin` (3,), with the same axes; itself for zero."""

@@ -104,7 +104,7 @@ def test_table_and_diagnosis(scene, capsys):
     for words in (
         "watertight",
         "v3.png",
-        "Mean mask/camera mismatch",
+        "Masks and cameras miss each other",
         "nothing wrong",
         "inside at least 3 of 4 masks",
     ):

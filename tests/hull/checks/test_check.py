@@ -364,3 +364,24 @@ def test_specks_and_border():
     cut = np.zeros((30, 30), bool)
     cut[0:20, 5:15] = True
     assert border_contact(cut) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("count", [4, 6, 9])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda K: K * torch.tensor([[0.4, 1, 1], [1, 0.4, 1], [1, 1, 1]]),
+        lambda K: K * torch.tensor([[2.5, 1, 1], [1, 2.5, 1], [1, 1, 1]]),
+        lambda K: K * torch.tensor([[5.0, 1, 1], [1, 5.0, 1], [1, 1, 1]]),
+        lambda K: K * torch.tensor([[1, 1, 1.3], [1, 1, 1], [1, 1, 1]]),
+    ],
+    ids=["too short", "too long", "much too long", "off centre"],
+)
+def test_wrong_intrinsics_are_not_answered_with_another_k(spoil, count):
+    views = make_scene(SyntheticConfig(size=64, train_views=count)).train
+    cameras = replace(views.cameras, intrinsics=spoil(views.cameras.intrinsics))
+    found = check(cameras, views.masks)
+    assert found.findings
+    assert not any("use K" in f.todo for f in found.findings)
+    for f in found.findings:
+        assert f.kind != "covisibility" or "intrinsics are wrong" in f.todo

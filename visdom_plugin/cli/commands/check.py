@@ -25,6 +25,10 @@ FOUND = 1
 """Exit status with findings."""
 
 
+GEOMETRY = {"axes", "centres", "disagreement", "order", "principal", "scale", "swapped", "view"}
+"""Kinds of findings by which masks and cameras do not fit each other, whatever K is."""
+
+
 @dataclass(frozen=True)
 class Options(FolderOptions):
     """Check cameras, masks and photographs of a scene.
@@ -238,13 +242,17 @@ def _table(report: dict[str, Any]) -> None:
 
 
 def summarise_fit(report: dict[str, Any]) -> list[str]:
-    """A line on K and one on how well masks and cameras fit, as far as `describe_check` knows them."""
+    """Lines on K, and on how well masks and cameras fit, as far as `describe_check` knows them."""
     lines = [report["k_why"]] if "k_why" in report else []
+    if lines and not GEOMETRY.isdisjoint(f["kind"] for f in report["findings"]):
+        lines = ["Which K the views allow is told once poses and intrinsics fit the masks."]
     if "misfit" in report:
-        lines.append(
-            f"Mean mask/camera mismatch: {report['misfit']:.2%} of the object's size. Rays just outside one mask "
-            f"pass the other masks at {report['constraint']:.1%} of it on average (farther: a tighter hull)."
-        )
+        lines += [
+            f"Masks and cameras miss each other by {report['misfit']:.2%} of the object's size on average; 0 is a "
+            "perfect fit.",
+            f"Right beside each mask, the other masks rule the object out by {report['constraint']:.1%} of its "
+            "size on average; near 0 they would not notice a wrong pose.",
+        ]
     return lines
 
 

@@ -129,7 +129,9 @@ def check(
     if left.sum() >= 2 and not any(c.kind in ("axes", "scale", "order", "swapped") for c in causes):
         kept = Name([names[i] for i in usable[left]])
         advice = advise_k(rest, kept, fit, USUAL_K if k is None else k)
-        found += _covisibility(advice, usable[left], k, names)
+        # Views that do not fit each other seem to have little in common at any K.
+        if not causes and fit.score <= _DISAGREE_PX:
+            found += _covisibility(advice, usable[left], k, names)
         found += _clustered(rest, fit, chosen)
     notes, found = _split(found)
     found.sort(key=lambda f: ("certain", "likely", "possible").index(f.sure))
@@ -347,6 +349,11 @@ def _covisibility(advice: Advice, views: np.ndarray, asked: int | None, names: N
 
 def _seen(what: str, views: np.ndarray, lost: np.ndarray, todo: str, note: bool) -> Finding:
     """A finding on what the views see in common; `lost` (N,) is the share that each view's mask loses."""
+    if 2 * (lost > LOST).sum() > len(lost):
+        todo += (
+            "; where they do show it, poses or intrinsics are wrong: with too long a focal length views miss "
+        )
+        todo += "each other"
     concerned = tuple(int(v) for v in views[lost > LOST])
     return Finding("covisibility", what, concerned, "certain", float(lost.max()), todo, note=note)
 
