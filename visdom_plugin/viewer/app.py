@@ -1,0 +1,352 @@
+"""The viewer: cameras, hull and reconstructions in a browser, with a rendered picture where the camera rests.
+
+The browser draws Gaussians and meshes while the camera moves. Where it rests, the method itself renders, from
+coarse to fine, as it would for an evaluation; nothing needs a GPU.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import torch
+
+from visdom_plugin.errors import PluginError
+from visdom_plugin.figures.contact_sheet import draw_error, to_bytes
+from visdom_plugin.geometry.camera_paths import capture_up
+from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.training.evaluate import draw_truth
+from visdom_plugin.viewer.shown import Subject, camera_from, nearest_view, pose_of, splat_arrays
+
+log = logging.getLogger(__name__)
+
+WIDTHS = (120, 240, 480)
+"""Widths of the rendered picture, one after the other."""
+_REST, _LOOK = 0.25, 2.0
+"""Seconds for which the camera must be still, and between two looks for a newer state of a run."""
+_BACKGROUNDS = {"white": 1.0, "grey": 0.5, "black": 0.0}
+_COLOURS = {"train": (20, 110, 200), "test": (210, 110, 20)}
+_PICTURE_PX = 160
+
+
+class Viewer:
+    """A server that shows a subject until `stop`.
+
+    Args:
+        subject: scene, hull and runs.
+        host, port: where it listens.
+
+    Raises:
+        PluginError: viser is not installed.
+    """
+
+    def __init__(self, subject: Subject, host: str, port: int):
+        try:
+            import viser
+        except ImportError as error:
+            raise PluginError(
+                "the viewer needs viser, which is not installed",
+                todo="pip install 'visdom-plugin[viewer]'",
+            ) from error
+        self.subject = subject
+        cameras = subject.scene.train.cameras
+        centre = look_at_point(cameras).double().numpy() if subject.hull is None else subject.hull.centre
+        self.middle = np.asarray(centre, np.float64)
+        self.size = float((cameras.centres.double() - torch.as_tensor(self.middle)).norm(dim=-1).mean())
+        self.server = viser.ViserServer(host=host, port=port, label="visdom-view", verbose=False)
+        self.server.scene.set_up_direction(tuple(capture_up(cameras).double().tolist()))
+        self.handles: dict[str, list[Any]] = {"train": [], "test": [], "hull": [], "inner": [], "runs": []}
+        self.controls: dict[str, Any] = {}
+        self.moved: dict[int, float] = {}
+        self.drawn: dict[int, tuple[float, int]] = {}
+        self._done = threading.Event()
+        self._lock = threading.RLock()
+        self._add_controls()
+        for part in ("train", "test"):
+            self._add_views(part)
+        self._add_hull()
+        self._add_runs()
+        self.server.on_client_connect(self._welcome)
+        self._worker = threading.Thread(target=self._work, name="viewer", daemon=True)
+        self._worker.start()
+
+    def stop(self) -> None:
+        """Ends the server."""
+        self._done.set()
+        self._worker.join(30)
+        self.server.stop()
+
+    def wait(self) -> None:
+        """Returns when `stop` is called, or on Ctrl-C."""
+        while not self._done.wait(0.5):
+            pass
+
+    def _add_controls(self) -> None:
+        gui, controls, subject = self.server.gui, self.controls, self.subject
+        gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False)
+        names = [*subject.scene.train.names, *subject.scene.test.names]
+        controls["view"] = gui.add_dropdown("Go to view", ("-", *map(str, names)))
+        controls["view"].on_update(self._go_to_view)
+        with gui.add_folder("Cameras"):
+            controls["train"] = gui.add_checkbox("Training views", True)
+            controls["test"] = gui.add_checkbox("Test views", False, disabled=not len(subject.scene.test))
+            controls["pictures"] = gui.add_dropdown("Pictures", ("photographs", "masks", "none"))
+        with gui.add_folder("Hull"):
+            controls["hull"] = gui.add_checkbox("Hull", not subject.runs, disabled=subject.hull is None)
+            controls["opacity"] = gui.add_slider(
+                "Opacity", 0.05, 1.0, 0.05, 0.4, disabled=subject.hull is None
+            )
+            inner = subject.hull is not None and subject.hull.inner is not None
+            controls["inner"] = gui.add_checkbox("Shape inside", False, disabled=not inner)
+        none = not subject.runs
+        with gui.add_folder("Reconstruction"):
+            controls["runs"] = gui.add_checkbox("Gaussians or mesh", not none, disabled=none)
+            controls["crop"] = gui.add_checkbox("Crop by hull", False, disabled=none or subject.hull is None)
+            controls["render"] = gui.add_checkbox("Render at rest", not none, disabled=none)
+            controls["background"] = gui.add_dropdown("Background", tuple(_BACKGROUNDS))
+            controls["error"] = gui.add_checkbox("Error, nearest photo", False, disabled=none)
+            labels = tuple(run.label for run in subject.runs)
+            if len(labels) > 1:
+                controls["run"] = gui.add_dropdown("Run", labels)
+                controls["split"] = gui.add_slider("Left run's share", 0, 100, 1, 100)
+            controls["state"] = gui.add_markdown("")
+        for name in ("train", "test", "hull", "inner"):
+            controls[name].on_update(lambda _, name=name: self._show(name))
+        controls["runs"].on_update(lambda _: self._again())
+        controls["pictures"].on_update(lambda _: [self._add_views(part) for part in ("train", "test")])
+        controls["opacity"].on_update(lambda _: self._add_hull())
+        controls["crop"].on_update(lambda _: self._add_runs())
+        for name in ("render", "background", "error", "run", "split"):
+            if name in controls:
+                controls[name].on_update(
+                    lambda _, name=name: self._add_runs() if name == "run" else self._again()
+                )
+
+    def _show(self, name: str) -> None:
+        for handle in self.handles[name]:
+            handle.visible = self.controls[name].value
+
+    def _clear(self, name: str) -> None:
+        for handle in self.handles[name]:
+            handle.remove()
+        self.handles[name] = []
+
+    def _add_views(self, part: str) -> None:
+        with self._lock:
+            self._clear(part)
+            views, kind = getattr(self.subject.scene, part), self.controls["pictures"].value
+            for i, name in enumerate(views.names):
+                camera = views.cameras[i]
+                width, height = int(camera.width), int(camera.height)
+                step = max(1, width // _PICTURE_PX)
+                image = None
+                if kind == "photographs":
+                    image = np.asarray(views.images[i])[::step, ::step]
+                elif kind == "masks":
+                    mask = np.asarray(views.masks[i])[::step, ::step]
+                    image = np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, 2)
+                self.handles[part].append(
+                    self.server.scene.add_camera_frustum(
+                        f"/{part}/{i}_{name}",
+                        fov=2 * float(torch.atan(height / 2 / camera.intrinsics[1, 1].double())),
+                        aspect=width / height,
+                        scale=0.1 * self.size,
+                        thickness=0.003 * self.size,
+                        color=_COLOURS[part],
+                        image=image,
+                        visible=self.controls[part].value,
+                        **pose_of(camera, self.middle),
+                    )
+                )
+                self.handles[part][-1].on_click(lambda _, name=name: self._jump(str(name)))
+
+    def _add_hull(self) -> None:
+        with self._lock:
+            hull = self.subject.hull
+            if hull is None:
+                return
+            for name, shape, colour in (
+                ("hull", hull, (90, 170, 230)),
+                ("inner", hull.inner, (240, 150, 60)),
+            ):
+                self._clear(name)
+                if shape is not None:
+                    vertices, faces = shape.to_mesh()
+                    self.handles[name].append(
+                        self.server.scene.add_mesh_simple(
+                            f"/{name}",
+                            (vertices - self.middle).astype(np.float32),
+                            faces.astype(np.uint32),
+                            color=colour,
+                            opacity=self.controls["opacity"].value,
+                            side="double",
+                            visible=self.controls[name].value,
+                        )
+                    )
+
+    @property
+    def chosen(self) -> int:
+        """Number of the run that the browser draws."""
+        control = self.controls.get("run")
+        return 0 if control is None else [r.label for r in self.subject.runs].index(control.value)
+
+    def _add_runs(self) -> None:
+        if not self.subject.runs:
+            return
+        with self._lock:
+            run = self.subject.runs[self.chosen]
+            crop = self.controls["crop"].value and self.subject.hull is not None
+            found = run.gaussians()
+            made: Any = None
+            if found is not None:
+                arrays = splat_arrays(found[0], found[1].numpy() - self.middle)
+                if crop:
+                    kept = self._inside(arrays["centers"])
+                    arrays = {name: value[kept] for name, value in arrays.items()}
+                self._clear("runs")
+                made = self.server.scene.add_gaussian_splats("/run", **arrays)
+            elif (mesh := run.mesh()) is not None:
+                from trimesh import Trimesh
+
+                from visdom_plugin.export.meshes import crop as crop_mesh
+
+                if crop:
+                    mesh = crop_mesh(mesh, lambda x: self._inside(x - self.middle))
+                self._clear("runs")
+                shape = Trimesh(
+                    mesh.vertices - self.middle, mesh.faces, vertex_colors=mesh.rgb, process=False
+                )
+                made = self.server.scene.add_mesh_trimesh("/run", shape)
+            if made is not None:
+                self.handles["runs"] = [made]
+            self._again()
+
+    def _inside(self, points: np.ndarray) -> np.ndarray:
+        assert self.subject.hull is not None
+        return self.subject.hull.contains(np.asarray(points, np.float64) + self.middle, margin_voxels=1)
+
+    def _welcome(self, client: Any) -> None:
+        self._place(client, self.subject.scene.train.cameras[0])
+        client.camera.on_update(lambda _: self._moved(client))
+        self._moved(client)
+
+    def _place(self, client: Any, camera: Cameras) -> None:
+        pose = pose_of(camera, self.middle)
+        with client.atomic():
+            client.camera.fov = 2 * float(torch.atan(camera.height / 2 / camera.intrinsics[1, 1].double()))
+            client.camera.wxyz = pose["wxyz"]
+            client.camera.position = pose["position"]
+            ahead = camera.forward.double().numpy()
+            client.camera.look_at = pose["position"] + ahead * max(
+                -float(pose["position"] @ ahead), 0.1 * self.size
+            )
+
+    def _go_to_view(self, _: Any) -> None:
+        self._jump(self.controls["view"].value)
+
+    def _jump(self, name: str) -> None:
+        for views in (self.subject.scene.train, self.subject.scene.test):
+            names = [str(n) for n in views.names]
+            if name in names:
+                for client in self.server.get_clients().values():
+                    self._place(client, views.cameras[names.index(name)])
+
+    def _moved(self, client: Any) -> None:
+        self.moved[client.client_id] = time.monotonic()
+        if self.drawn.pop(client.client_id, None) is not None:
+            client.scene.set_background_image(None)
+        self._show_runs(True)
+
+    def _again(self) -> None:
+        """The pictures at rest are drawn anew."""
+        for client in self.server.get_clients().values():
+            self._moved(client)
+
+    def _show_runs(self, moving: bool) -> None:
+        for handle in self.handles["runs"]:
+            handle.visible = self.controls["runs"].value and moving
+
+    def _work(self) -> None:
+        looked = time.monotonic()
+        while not self._done.wait(0.05):
+            try:
+                for client in list(self.server.get_clients().values()):
+                    self._refine(client)
+                if time.monotonic() - looked > _LOOK:
+                    looked = time.monotonic()
+                    self._look_for_news()
+            except Exception as error:
+                if not self._done.is_set():
+                    log.warning("the viewer could not draw: %r", error)
+                    time.sleep(1)
+
+    def _look_for_news(self) -> None:
+        steps = [run.refresh() for run in self.subject.runs]
+        if any(step is not None for step in steps):
+            said = [
+                f"{r.label}: step {s}" for r, s in zip(self.subject.runs, steps, strict=True) if s is not None
+            ]
+            self.controls["state"].content = ", ".join(said)
+            self._add_runs()
+
+    def _refine(self, client: Any) -> None:
+        """Draws the next finer picture of a camera that rests."""
+        since = self.moved.get(client.client_id)
+        if since is None or not self.controls["render"].value or time.monotonic() - since < _REST:
+            return
+        level = self.drawn.get(client.client_id, (since, 0))[1]
+        if level >= len(WIDTHS):
+            return
+        with self._lock:
+            picture = self.draw(client.camera, WIDTHS[level])
+        if self.moved.get(client.client_id) == since:
+            client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90)
+            self.drawn[client.client_id] = since, level + 1
+            self._show_runs(False)
+
+    def draw(self, view: Any, width: int) -> np.ndarray:
+        """(H, W, 3) uint8 as the runs render it, or how far that is from the nearest photograph's render.
+
+        Args:
+            view: wxyz, position, fov and aspect of a browser's camera.
+        """
+        size = width, max(1, round(width / float(view.aspect)))
+        camera = camera_from(view.wxyz, view.position, float(view.fov), size, self.middle)
+        if self.controls["error"].value:
+            return self._draw_error(camera, width)
+        share = self.controls["split"].value / 100 if "split" in self.controls else 1.0
+        edge = round(share * size[0])
+        left = self._render(self.chosen, camera)
+        if edge >= size[0]:
+            return left
+        right = self._render((self.chosen + 1) % len(self.subject.runs), camera)
+        picture = np.concatenate([left[:, :edge], right[:, edge:]], 1)
+        picture[:, min(edge, size[0] - 1)] = (224, 33, 138)
+        return picture
+
+    def _render(self, number: int, camera: Cameras) -> np.ndarray:
+        run = self.subject.runs[number]
+        shade = _BACKGROUNDS[self.controls["background"].value]
+        with torch.no_grad():
+            render = run.renderer.render(camera.to(run.device), torch.full((3,), shade, device=run.device))
+        return to_bytes(render.rgb.detach().cpu())
+
+    def _draw_error(self, camera: Cameras, width: int) -> np.ndarray:
+        """Error against the nearest photograph, from where that was taken."""
+        import cv2
+
+        views = self.subject.scene.train
+        i = nearest_view(views.cameras, camera)
+        own = views.cameras[i]
+        height = max(1, round(int(own.height) * width / int(own.width)))
+        run = self.subject.runs[self.chosen]
+        with torch.no_grad():
+            render = run.renderer.render(
+                own.resized(width, height).to(run.device), torch.ones(3, device=run.device)
+            )
+        truth = cv2.resize(draw_truth(views, i, views.mask_origin(i) == "given"), (width, height))
+        self.controls["state"].content = f"error against {views.names[i]}"
+        return draw_error(truth, to_bytes(render.rgb.detach().cpu()))
