@@ -6,6 +6,8 @@ coarse to fine, as it would for an evaluation; nothing needs a GPU.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import logging
 import threading
 import time
@@ -56,7 +58,9 @@ class Viewer:
         centre = look_at_point(cameras).double().numpy() if subject.hull is None else subject.hull.centre
         self.middle = np.asarray(centre, np.float64)
         self.size = float((cameras.centres.double() - torch.as_tensor(self.middle)).norm(dim=-1).mean())
-        self.server = viser.ViserServer(host=host, port=port, label="visdom-view", verbose=False)
+        # Standard output is for the address alone.
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server = viser.ViserServer(host=host, port=port, label="visdom-view", verbose=False)
         self.server.scene.set_up_direction(tuple(capture_up(cameras).double().tolist()))
         self.handles: dict[str, list[Any]] = {"train": [], "test": [], "hull": [], "inner": [], "runs": []}
         self.controls: dict[str, Any] = {}
@@ -65,8 +69,7 @@ class Viewer:
         self._done = threading.Event()
         self._lock = threading.RLock()
         self._add_controls()
-        for part in ("train", "test"):
-            self._add_views(part)
+        self._add_all_views()
         self._add_hull()
         self._add_runs()
         self.server.on_client_connect(self._welcome)
@@ -116,7 +119,7 @@ class Viewer:
         for name in ("train", "test", "hull", "inner"):
             controls[name].on_update(lambda _, name=name: self._show(name))
         controls["runs"].on_update(lambda _: self._again())
-        controls["pictures"].on_update(lambda _: [self._add_views(part) for part in ("train", "test")])
+        controls["pictures"].on_update(lambda _: self._add_all_views())
         controls["opacity"].on_update(lambda _: self._add_hull())
         controls["crop"].on_update(lambda _: self._add_runs())
         for name in ("render", "background", "error", "run", "split"):
@@ -133,6 +136,10 @@ class Viewer:
         for handle in self.handles[name]:
             handle.remove()
         self.handles[name] = []
+
+    def _add_all_views(self) -> None:
+        for part in ("train", "test"):
+            self._add_views(part)
 
     def _add_views(self, part: str) -> None:
         with self._lock:
@@ -207,7 +214,9 @@ class Viewer:
                     kept = self._inside(arrays["centers"])
                     arrays = {name: value[kept] for name, value in arrays.items()}
                 self._clear("runs")
-                made = self.server.scene.add_gaussian_splats("/run", **arrays)
+                made = self.server.scene.add_gaussian_splats(
+                    "/run", arrays["centers"], arrays["covariances"], arrays["rgbs"], arrays["opacities"]
+                )
             elif (mesh := run.mesh()) is not None:
                 from trimesh import Trimesh
 
@@ -229,20 +238,22 @@ class Viewer:
         return self.subject.hull.contains(np.asarray(points, np.float64) + self.middle, margin_voxels=1)
 
     def _welcome(self, client: Any) -> None:
-        self._place(client, self.subject.scene.train.cameras[0])
+        # From behind the first camera, so that its picture and the object are in sight.
+        self._place(client, self.subject.scene.train.cameras[0], back=0.8 * self.size)
         client.camera.on_update(lambda _: self._moved(client))
         self._moved(client)
 
-    def _place(self, client: Any, camera: Cameras) -> None:
+    def _place(self, client: Any, camera: Cameras, back: float = 0.0) -> None:
         pose = pose_of(camera, self.middle)
+        ahead = camera.forward.double().cpu().numpy()
+        up = -camera.world_from_camera[:3, 1].double().cpu().numpy()
+        pose["position"] = pose["position"] + back * (0.35 * up - ahead)
         with client.atomic():
             client.camera.fov = 2 * float(torch.atan(camera.height / 2 / camera.intrinsics[1, 1].double()))
             client.camera.wxyz = pose["wxyz"]
             client.camera.position = pose["position"]
-            ahead = camera.forward.double().numpy()
-            client.camera.look_at = pose["position"] + ahead * max(
-                -float(pose["position"] @ ahead), 0.1 * self.size
-            )
+            depth = max(-float(pose["position"] @ ahead), 0.1 * self.size)
+            client.camera.look_at = np.zeros(3) if back else pose["position"] + ahead * depth
 
     def _go_to_view(self, _: Any) -> None:
         self._jump(self.controls["view"].value)
@@ -250,6 +261,10 @@ class Viewer:
     def _jump(self, name: str) -> None:
         for views in (self.subject.scene.train, self.subject.scene.test):
             names = [str(n) for n in views.names]
+            part = "train" if views is self.subject.scene.train else "test"
+            for i, handle in enumerate(self.handles[part]):
+                # Its own picture would stand before the eye.
+                handle.visible = self.controls[part].value and names[i] != name
             if name in names:
                 for client in self.server.get_clients().values():
                     self._place(client, views.cameras[names.index(name)])
@@ -343,10 +358,9 @@ class Viewer:
         own = views.cameras[i]
         height = max(1, round(int(own.height) * width / int(own.width)))
         run = self.subject.runs[self.chosen]
+        white = torch.ones(3, device=run.device)
         with torch.no_grad():
-            render = run.renderer.render(
-                own.resized(width, height).to(run.device), torch.ones(3, device=run.device)
-            )
+            render = run.renderer.render(own.resized(width, height).to(run.device), white)
         truth = cv2.resize(draw_truth(views, i, views.mask_origin(i) == "given"), (width, height))
         self.controls["state"].content = f"error against {views.names[i]}"
         return draw_error(truth, to_bytes(render.rgb.detach().cpu()))

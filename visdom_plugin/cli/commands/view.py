@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 class Options(SceneOptions):
     """Shows a scene, a run, two runs, or a file of Gaussians in the browser.
 
-    Cameras with their photographs, the hull, Gaussians or mesh; where the camera rests, what the method renders. A run
-    that is still training is followed from checkpoint to checkpoint. Needs the extra `viewer`.
+    Cameras with their photographs, the hull, Gaussians or mesh, and, where the camera rests, what the method
+    renders. A run that is still training is followed from checkpoint to checkpoint. Needs the extra `viewer`.
     """
 
     what: tyro.conf.Positional[Path | None] = None
@@ -55,12 +55,14 @@ def _view(argv: Sequence[str]) -> None:
         raise ConfigError("there is no such file or folder", where=what)
     from visdom_plugin.viewer.serve import choose_port, describe_address
 
-    port = choose_port(options.host, options.port)
+    choose_port(options.host, options.port)
     from visdom_plugin.cli.report import say
     from visdom_plugin.viewer.app import Viewer
 
-    viewer = Viewer(open_shown(options), options.host, port)
-    address, hint = describe_address(options.host, port)
+    subject = open_shown(options)
+    # Reading takes a while, in which somebody else may have taken it.
+    viewer = Viewer(subject, options.host, choose_port(options.host, options.port))
+    address, hint = describe_address(options.host, viewer.server.get_port())
     sys.stdout.write(f"{address}\n")
     sys.stdout.flush()
     if not options.quiet:

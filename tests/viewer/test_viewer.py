@@ -1,0 +1,178 @@
+"""The viewer shows a scene and a run in a browser, and what is toggled there changes the picture."""
+
+import socket
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from datamodules import load
+from tests import browser
+from tests.splat.twin import make_gaussians
+from visdom_plugin.cli.commands import view
+from visdom_plugin.cli.subject import PointCloud
+from visdom_plugin.errors import ConfigError, PluginError
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.splat.rasterise import rasterise
+from visdom_plugin.viewer.serve import choose_port, describe_address
+from visdom_plugin.viewer.shown import (
+    Reconstruction,
+    Subject,
+    camera_from,
+    nearest_view,
+    pose_of,
+    splat_arrays,
+)
+
+
+@pytest.fixture(scope="module")
+def subject():
+    scene = load(None, views=4, downscale=4)
+    hull = VisibleDomain(resolution=48).carve(*scene.train.silhouettes())
+    gaussians = replace(
+        make_gaussians(n=60, dtype=torch.float32).detach(), log_scales=torch.full((60, 3), -2.5)
+    )
+    origin = torch.as_tensor(hull.centre)
+    cloud = PointCloud(gaussians, origin, 0.01)
+    run = Reconstruction(
+        "cloud", cloud, torch.device("cpu"), lambda: (gaussians, origin), lambda: None, lambda: None
+    )
+    return Subject(scene, hull, (run,))
+
+
+def test_a_camera_goes_to_the_browser_and_back(subject):
+    camera = subject.scene.train.cameras[2].to(dtype=torch.float64)
+    middle = np.array([5.0, -3, 2])
+    pose = pose_of(camera, middle)
+    fov = 2 * float(torch.atan(camera.height / 2 / camera.intrinsics[1, 1]))
+    size = int(camera.width), int(camera.height)
+    back = camera_from(pose["wxyz"], pose["position"], fov, size, middle)
+    assert torch.allclose(back.world_from_camera, camera.world_from_camera, atol=1e-9)
+    assert torch.allclose(back.intrinsics[1, 1], camera.intrinsics[1, 1])
+
+
+def test_the_nearest_view_of_a_view_is_itself(subject):
+    cameras = subject.scene.train.cameras
+    middle = np.zeros(3)
+    for i in range(len(cameras)):
+        pose = pose_of(cameras[i], middle)
+        assert nearest_view(cameras, camera_from(pose["wxyz"], pose["position"], 1.0, (32, 24), middle)) == i
+
+
+def test_covariances_are_those_that_are_drawn():
+    gaussians = make_gaussians(n=7, dtype=torch.float64).detach()
+    arrays = splat_arrays(gaussians, np.array([1.0, 2, 3]))
+    assert np.allclose(arrays["centers"], gaussians.means + torch.tensor([1.0, 2, 3]), atol=1e-5)
+    values = np.linalg.eigvalsh(arrays["covariances"].astype(np.float64))
+    wanted = np.sort((2 * gaussians.log_scales).exp().numpy(), axis=1)
+    assert np.allclose(values, wanted, rtol=1e-3, atol=1e-7)
+
+
+def test_a_port_in_use_is_refused_and_a_free_one_is_found():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=f"port {port} "):
+            choose_port("127.0.0.1", port)
+    assert choose_port("127.0.0.1", None) >= 8080
+    assert describe_address("127.0.0.1", 8123)[0] == "http://localhost:8123"
+    assert "ssh -L 8123:localhost:8123" in describe_address("127.0.0.1", 8123)[1]
+
+
+def test_bad_input_gets_one_clear_line(tmp_path, capsys):
+    (tmp_path / "broken.ply").write_bytes(b"ply\nformat")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        busy = str(taken.getsockname()[1])
+        for words, said in (
+            ([str(tmp_path / "nothing")], "there is no such"),
+            ([str(tmp_path / "broken.ply")], "not a PLY point cloud"),
+            (["--beside", str(tmp_path)], "two runs are compared"),
+            (["--port", busy], f"port {busy}"),
+        ):
+            assert view.main(words) == 2
+            assert said in capsys.readouterr().err
+
+
+def test_without_viser_the_extra_is_named(subject, monkeypatch):
+    import sys
+
+    from visdom_plugin.viewer.app import Viewer
+
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(PluginError, match=r"(?s)viser.*visdom-plugin\[viewer\]"):
+        Viewer(subject, "127.0.0.1", 0)
+
+
+@pytest.fixture
+def viewer(subject):
+    pytest.importorskip("viser")
+    from visdom_plugin.viewer.app import Viewer
+
+    made = Viewer(subject, "127.0.0.1", choose_port("127.0.0.1", None))
+    yield made
+    made.stop()
+
+
+def test_the_rendered_picture_is_the_methods_own(viewer, subject):
+    camera = subject.scene.train.cameras[0].to(dtype=torch.float64)
+    width, height = int(camera.width), int(camera.height)
+    # A browser looks through the middle of its window.
+    K = camera.intrinsics.clone()
+    K[:2, 2] = torch.tensor([width / 2, height / 2])
+    K[0, 0] = K[1, 1]
+    camera = replace(camera, intrinsics=K)
+    pose = pose_of(camera, viewer.middle)
+
+    class Browser:
+        wxyz, position, aspect = pose["wxyz"], pose["position"], width / height
+        fov = 2 * float(torch.atan(height / 2 / camera.intrinsics[1, 1]))
+
+    drawn = viewer.draw(Browser, width)
+    run = subject.runs[0].renderer
+    wanted = rasterise(run.gaussians, camera.relative_to(run.origin), torch.ones(3), near=0.01).rgb
+    assert (np.abs(drawn / 255 - wanted.clamp(0, 1).numpy()) < 0.02).mean() > 0.98
+    viewer.controls["background"].value = "black"
+    assert viewer.draw(Browser, width)[0, 0].max() == 0 and drawn[0, 0].min() == 255
+    viewer.controls["error"].value = True
+    assert viewer.draw(Browser, width).shape == drawn.shape
+
+
+@browser.needed
+@pytest.mark.slow
+def test_toggles_change_what_the_browser_shows(viewer):
+    def still(page):
+        """The picture, once two in a row are the same."""
+        before = page.picture()[:, :600]
+        for _ in range(60):
+            time.sleep(0.5)
+            now = page.picture()[:, :600]
+            if (now == before).all():
+                return now
+            before = now
+        raise TimeoutError("the picture never comes to rest")
+
+    with browser.Page() as page:
+        page.size(900, 600)
+        page.open(f"http://127.0.0.1:{viewer.server.get_port()}")
+        page.until("document.querySelector('canvas')")
+        page.until("document.body.innerText.includes('Shape inside')")
+        time.sleep(2)
+        seen = still(page)
+        assert seen.std() > 1
+        for name, value in (("hull", True), ("test", True), ("train", False), ("background", "black")):
+            viewer.controls[name].value = value
+            after = still(page)
+            assert (after != seen).any(), name
+            seen = after
+        position = next(iter(viewer.server.get_clients().values())).camera.position.copy()
+        viewer.controls["view"].value = viewer.subject.scene.train.names[1]
+        still(page)
+        moved = next(iter(viewer.server.get_clients().values())).camera.position
+        wanted = viewer.subject.scene.train.cameras[1].centres.numpy() - viewer.middle
+        assert np.allclose(moved, wanted, atol=0.05) and not np.allclose(position, wanted, atol=0.05)
+        assert not [e for e in page.errors if "THREE" not in e]
