@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, cast, get_a
 
 import tyro
 
-from datamodules.recognise import FORMATS
+from datamodules.recognise import FORMATS, find_folder
 from visdom_plugin import registry
 from visdom_plugin.cli.early import WORD, Early, read_early
 from visdom_plugin.errors import ConfigError, unknown_name
@@ -101,6 +101,15 @@ class FolderOptions(SceneOptions):
         if self.folder is not None and self.data is not None and self.folder != self.data:
             raise ConfigError(f"two scenes: {self.folder} and {self.data}", todo="name one")
         return self.folder or self.data
+
+    def find_scene_folder(self) -> Path | None:
+        """The scene that was named; asked before what takes seconds to import.
+
+        Raises:
+            ConfigError: two are named.
+            SceneError: there is no such folder.
+        """
+        return None if self.scene_folder is None else find_folder(self.scene_folder)
 
 
 @dataclass(frozen=True)

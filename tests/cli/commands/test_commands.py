@@ -352,11 +352,13 @@ def test_every_command_says_its_version(capsys, command):
     assert re.fullmatch(r"visdom-plugin \d+\.\d+\S*\n", capsys.readouterr().out)
 
 
-def test_a_mistake_in_the_scenes_name_needs_no_heavy_import():
+@pytest.mark.parametrize("words", [["train", "method:ingp"], ["check"], ["hull"]])
+def test_a_mistake_in_the_scenes_name_needs_no_heavy_import(words):
+    name, *method = words
     code = (
         "import sys\n"
-        "from visdom_plugin.cli.commands.train import main\n"
-        "assert main(['method:ingp', '/no/such/folder']) == 2\n"
+        f"from visdom_plugin.cli.commands.{name} import main\n"
+        f"assert main([*{method}, '/no/such/folder']) == 2\n"
         "heavy = {'torch', 'numba', 'cv2', 'skimage', 'scipy'} & set(sys.modules)\n"
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )

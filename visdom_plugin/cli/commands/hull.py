@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(argv: Sequence[str]) -> None:
     options = tyro.cli(Options, args=list(argv), prog="visdom-hull")
-    folder = options.scene_folder
+    folder = options.find_scene_folder()
     if options.out is not None and options.out.suffix not in (".ply", ".npz"):
         raise ConfigError(
             f"cannot write {options.out.name}",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from datamodules.recognise import find_folder
 from visdom_plugin.cli import entry, options
 
 
@@ -20,8 +19,7 @@ def _train(argv: Sequence[str]) -> None:
     if common.show_config:
         sys.stdout.write(options.dump(request))
         return
-    if common.data is not None:
-        find_folder(common.data)
+    common.find_scene_folder()
     device = options.resolve_device(common.device)
 
     from visdom_plugin.cli.commands.check import warn_of_faults
