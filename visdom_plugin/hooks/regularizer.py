@@ -46,19 +46,19 @@ def outside_loss(alpha: Tensor, hull_mask: Tensor) -> Tensor:
 
 
 class _Outside(torch.autograd.Function):
-    """The loss in a third of the kernels that its parts take; `losses.below_one` says what happens at 1."""
+    """The loss in fewer kernels than autograd makes of it; `losses.below_one` says what happens at 1."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, alpha: Tensor, hull_mask: Tensor) -> Tensor:
         bounded = alpha.clamp_max(OPAQUE)
         ctx.save_for_backward(bounded, hull_mask)
-        return torch.where(hull_mask, 0.0, -torch.log1p(-bounded)).mean()
+        return -bounded.neg().log1p_().masked_fill_(hull_mask, 0).mean()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None]:
         bounded, hull_mask = ctx.saved_tensors
-        return torch.where(hull_mask, 0.0, slope / bounded.numel()) / (1 - bounded), None
+        return (slope / bounded.numel() / (1 - bounded)).masked_fill_(hull_mask, 0), None
 
 
 class Opacity(Protocol):
