@@ -89,7 +89,7 @@ class Viewer:
 
     def _add_controls(self) -> None:
         gui, controls, subject = self.server.gui, self.controls, self.subject
-        gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False)
+        gui.configure_theme(show_logo=False, show_share_button=False)
         names = [*subject.scene.train.names, *subject.scene.test.names]
         controls["view"] = gui.add_dropdown("Go to view", ("-", *map(str, names)))
         controls["view"].on_update(self._go_to_view)
