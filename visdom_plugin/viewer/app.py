@@ -238,7 +238,7 @@ class Viewer:
         return self.subject.hull.contains(np.asarray(points, np.float64) + self.middle, margin_voxels=1)
 
     def _welcome(self, client: Any) -> None:
-        # From behind the first camera, so that its picture and the object are in sight.
+        # From beside the first camera, so that its picture and the object are in sight.
         self._place(client, self.subject.scene.train.cameras[0], back=0.8 * self.size)
         client.camera.on_update(lambda _: self._moved(client))
         self._moved(client)
@@ -246,8 +246,9 @@ class Viewer:
     def _place(self, client: Any, camera: Cameras, back: float = 0.0) -> None:
         pose = pose_of(camera, self.middle)
         ahead = camera.forward.double().cpu().numpy()
+        right = camera.world_from_camera[:3, 0].double().cpu().numpy()
         up = -camera.world_from_camera[:3, 1].double().cpu().numpy()
-        pose["position"] = pose["position"] + back * (0.35 * up - ahead)
+        pose["position"] = pose["position"] + back * (0.5 * up + right - 0.5 * ahead)
         with client.atomic():
             client.camera.fov = 2 * float(torch.atan(camera.height / 2 / camera.intrinsics[1, 1].double()))
             client.camera.wxyz = pose["wxyz"]
