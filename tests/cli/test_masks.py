@@ -35,6 +35,7 @@ def scene(monkeypatch, tmp_path):
     holder = {"scene": made}
     monkeypatch.setattr(datamodules, "load", lambda path, **keywords: holder["scene"], raising=False)
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "somewhere").mkdir()
     return holder
 
 

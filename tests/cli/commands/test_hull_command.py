@@ -3,12 +3,14 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
 from tests.hull.balls import ball_masks, ring
+from visdom_plugin.cli import options
 from visdom_plugin.cli.commands.hull import main
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import Scene, Views
@@ -33,6 +35,7 @@ def scene(monkeypatch):
         return Scene("ball", views, views)
 
     monkeypatch.setattr(datamodules, "load", load, raising=False)
+    monkeypatch.setattr(options, "find_folder", Path)
     return asked
 
 
