@@ -111,9 +111,8 @@ class Cameras:
         return self.width.shape[0]
 
     def __getitem__(self, index) -> Cameras:
-        return Cameras(
-            self.intrinsics[index], self.world_from_camera[index], self.width[index], self.height[index]
-        )
+        K, motion = self.intrinsics[index], self.world_from_camera[index]
+        return Cameras(K, motion, self.width[index], self.height[index])
 
     @cached_property
     def size(self) -> tuple[int, int]:
@@ -122,13 +121,9 @@ class Cameras:
 
     def to(self, device=None, dtype: torch.dtype | None = None) -> Cameras:
         """The same cameras on another device or in another floating dtype."""
-        moved = Cameras(
-            self.intrinsics.to(device=device, dtype=dtype),
-            self.world_from_camera.to(device=device, dtype=dtype),
-            self.width.to(device=device),
-            self.height.to(device=device),
-        )
-        return self._hand_size(moved)
+        K, motion = (x.to(device=device, dtype=dtype) for x in (self.intrinsics, self.world_from_camera))
+        width, height = (x.to(device=device) for x in (self.width, self.height))
+        return self._hand_size(Cameras(K, motion, width, height))
 
     def _hand_size(self, other: Cameras) -> Cameras:
         """`other`, which has the same size and need not read it from the device again."""
@@ -170,9 +165,8 @@ class Cameras:
         width, height = _sizes(self.shape, self.width.device, width=width, height=height)
         sizes = (width.double() / self.width, height.double() / self.height)
         ratio = torch.stack([*sizes, torch.ones_like(sizes[0])], -1)
-        return Cameras(
-            self.intrinsics * ratio[..., None].to(self.intrinsics), self.world_from_camera, width, height
-        )
+        K = self.intrinsics * ratio[..., None].to(self.intrinsics)
+        return Cameras(K, self.world_from_camera, width, height)
 
 
 def _as_tensor(value) -> Tensor:
