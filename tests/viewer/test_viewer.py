@@ -11,11 +11,12 @@ import torch
 from datamodules import load
 from tests import browser
 from tests.splat.twin import make_gaussians
-from visdom_plugin.cli.commands import view
+from visdom_plugin.cli.commands import train, view
 from visdom_plugin.cli.subject import PointCloud
 from visdom_plugin.errors import ConfigError, PluginError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.splat.rasterise import rasterise
+from visdom_plugin.training.runs import checkpoints
 from visdom_plugin.viewer.serve import choose_port, describe_address
 from visdom_plugin.viewer.shown import (
     Reconstruction,
@@ -106,6 +107,63 @@ def test_without_viser_the_extra_is_named(subject, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(PluginError, match=r"(?s)viser.*visdom-plugin\[viewer\]"):
         Viewer(subject, "127.0.0.1", 0)
+
+
+def test_a_run_that_trains_is_followed(tmp_path):
+    import threading
+
+    folder = tmp_path / "run"
+    loaded = []
+
+    class Method:
+        def load_state_dict(self, state):
+            loaded.append(int(state["x"]))
+
+    def begin():
+        (folder / "checkpoints").mkdir(parents=True)
+        (folder / "run.json").write_text("{}")
+        checkpoints.save(folder / "checkpoints", 10, {"x": torch.tensor(1)}, {})
+
+    later = threading.Timer(0.3, begin)
+    later.start()
+    view.wait_for_state(folder, 0.02)
+    later.join()
+    refresh = view._follow(folder, Method())
+    assert refresh() is None and not loaded
+    checkpoints.save(folder / "checkpoints", 20, {"x": torch.tensor(2)}, {})
+    assert refresh() == 20 and loaded == [2]
+    assert refresh() is None
+    checkpoints.save(folder / "checkpoints", 30, {"x": torch.tensor(3)}, {})
+    (folder / "checkpoints" / "step-00000030.safetensors").write_bytes(b"torn")
+    assert refresh() is None and loaded == [2]
+
+
+def test_training_is_shown_by_a_viewer_of_its_own(fakes, monkeypatch):
+    pytest.importorskip("viser")
+    import subprocess
+
+    calls = []
+
+    class Process:
+        def __init__(self, words):
+            calls.append(words)
+
+        def terminate(self):
+            calls.append("terminated")
+
+        def wait(self):
+            calls.append("waited")
+
+    real = subprocess.Popen
+
+    def start(words, **others):
+        return Process(words) if "visdom_plugin.cli.commands.view" in words else real(words, **others)
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    words = ["method:fake", "--view", "--quiet", "--no-report", "--out", "run", "--method.steps", "3"]
+    assert train.main(words) == 0
+    assert calls[0][1:] == ["-m", "visdom_plugin.cli.commands.view", "run", "--wait"]
+    assert calls[1:] == ["terminated", "waited"]
 
 
 @pytest.fixture

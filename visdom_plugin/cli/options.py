@@ -130,6 +130,8 @@ class Common(FolderOptions):
     """Seconds between checkpoints; results do not depend on it."""
     config: Path | None = None
     """YAML file with settings, as --show-config prints them."""
+    view: bool = False
+    """Show the training in the browser, from its first checkpoint to its end; visdom-view shows it afterwards."""
     report: bool = True
     """End with report.html in the run directory, one page that shows what came out."""
     show_config: bool = False

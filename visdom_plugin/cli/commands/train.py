@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
 
 from visdom_plugin.cli import entry, options
 
@@ -47,13 +49,41 @@ def _train(argv: Sequence[str]) -> None:
         from visdom_plugin.cli.reports import report_finished
 
         on_finished = partial(report_finished, scene=scene, run_dir=folder, device=device, check=find_briefly)
-    record = train_as_asked(request, scene, folder, device, on_finished)
+    with watching(folder) if common.view else nullcontext():
+        record = train_as_asked(request, scene, folder, device, on_finished)
     if not common.quiet:
         if record["already_finished"]:
             say("this run is finished already; nothing was done (train again with --overwrite)")
         elif record["resumed_from"] is not None:
             say(f"resumed after step {record['resumed_from']}")
         show_result(record, folder)
+
+
+@contextmanager
+def watching(folder: Path) -> Iterator[None]:
+    """A block during which visdom-view shows the run of a folder, in a process of its own.
+
+    Raises:
+        PluginError: viser is not installed.
+    """
+    import subprocess
+    from importlib.util import find_spec
+
+    from visdom_plugin.errors import PluginError
+
+    if find_spec("viser") is None:
+        raise PluginError(
+            "the viewer needs viser, which is not installed",
+            where="--view",
+            todo="pip install 'visdom-plugin[viewer]', or leave --view out",
+        )
+    words = [sys.executable, "-m", "visdom_plugin.cli.commands.view", str(folder), "--wait"]
+    viewer = subprocess.Popen(words)
+    try:
+        yield
+    finally:
+        viewer.terminate()
+        viewer.wait()
 
 
 if __name__ == "__main__":

@@ -35,6 +35,8 @@ class Options(SceneOptions):
     """Run directory, folder of a scene, or a .ply, .spz, .splat or .sog file; without it, the built-in scene."""
     beside: Path | None = None
     """A second run on the same scene, to compare with."""
+    wait: bool = False
+    """Wait for a run that is about to begin, until it has a state to show."""
     host: str = "127.0.0.1"
     """Address to listen at; 0.0.0.0 lets the whole network in."""
     port: int | None = None
@@ -51,6 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _view(argv: Sequence[str]) -> None:
     options = tyro.cli(Options, args=list(argv), prog="visdom-view")
     what = options.what
+    if what is not None and options.wait:
+        wait_for_state(what)
     if what is not None and not what.exists():
         raise ConfigError("there is no such file or folder", where=what)
     from visdom_plugin.viewer.serve import choose_port, describe_address
@@ -71,6 +75,16 @@ def _view(argv: Sequence[str]) -> None:
         viewer.wait()
     finally:
         viewer.stop()
+
+
+def wait_for_state(run: Path, seconds: float = 0.5) -> None:
+    """Returns when a run directory holds a checkpoint; looks every so many seconds."""
+    import time
+
+    from visdom_plugin.training.runs.checkpoints import list_steps
+
+    while not (is_run(run) and list_steps(run / "checkpoints")):
+        time.sleep(seconds)
 
 
 def open_shown(options: Options) -> Subject:

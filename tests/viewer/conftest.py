@@ -1,0 +1,3 @@
+from tests.cli.conftest import fakes
+
+__all__ = ["fakes"]
