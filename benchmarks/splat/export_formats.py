@@ -21,8 +21,7 @@ from visdom_plugin.cli.runs import open_run
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.export import meshes, splat_files
 from visdom_plugin.export.fusion import fuse
-from visdom_plugin.geometry.cameras import mean_distance
-from visdom_plugin.geometry.local_frame import local_origin
+from visdom_plugin.geometry.local_frame import local_origin, mean_distance
 from visdom_plugin.hull.queries.surface_distance import compare_points, draw_on_surface
 from visdom_plugin.render import quantise
 from visdom_plugin.splat.rasterise import NEAR, rasterise

@@ -100,8 +100,7 @@ def open_point_cloud(path: Path, options: SceneOptions, device: str, *, test: bo
     from visdom_plugin.cli.report import say
     from visdom_plugin.cli.scenes import open_scene
     from visdom_plugin.export.splat_files import read_splats
-    from visdom_plugin.geometry.cameras import mean_distance
-    from visdom_plugin.geometry.local_frame import local_origin
+    from visdom_plugin.geometry.local_frame import local_origin, mean_distance
     from visdom_plugin.splat.rasterise import NEAR
 
     where = torch.device(resolve_device(device))

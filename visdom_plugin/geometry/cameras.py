@@ -392,9 +392,3 @@ def look_at_point(cameras: Cameras) -> Tensor:
     pull = 1e-6 * len(cameras)
     matrix = across.sum(0) + pull * torch.eye(3).to(centres)
     return torch.linalg.solve(matrix, (across @ centres[:, :, None]).sum(0)[:, 0] + pull * prior)
-
-
-def mean_distance(cameras: Cameras, target: Tensor | None = None) -> Tensor:
-    """Scalar mean distance of the cameras (N,) from a point (3,), by default the one they look at, scene units."""
-    target = look_at_point(cameras) if target is None else target
-    return (cameras.centres - target).norm(dim=-1).mean()

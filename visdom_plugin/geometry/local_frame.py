@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.geometry.cameras import Cameras, look_at_point, mean_distance
+from visdom_plugin.geometry.cameras import Cameras, look_at_point
 
 REACH = 100
 """How many of its own sizes a scene may be away from the origin: float32 then rounds by 6e-6 of the size."""
@@ -59,3 +59,9 @@ def local_origin(cameras: Cameras) -> Tensor:
         return torch.zeros(3, dtype=torch.float64)
     step = 10.0 ** math.ceil(math.log10(distance))
     return step * torch.round((middle + centre) / step)
+
+
+def mean_distance(cameras: Cameras, target: Tensor | None = None) -> Tensor:
+    """Scalar mean distance of the cameras (N,) from a point (3,), by default the one they look at, scene units."""
+    target = look_at_point(cameras) if target is None else target
+    return (cameras.centres - target).norm(dim=-1).mean()

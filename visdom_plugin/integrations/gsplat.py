@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.errors import CheckpointError, ConfigError, PluginError
-from visdom_plugin.geometry.cameras import Cameras, mean_distance
-from visdom_plugin.geometry.local_frame import require_near
+from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.geometry.local_frame import mean_distance, require_near
 from visdom_plugin.hooks.protocols import Means
 from visdom_plugin.hooks.regularizer import Opacity, VisDomGaussianRegularizer
 from visdom_plugin.render import Render

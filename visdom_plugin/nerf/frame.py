@@ -7,7 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from visdom_plugin.geometry.cameras import Cameras, look_at_point, mean_distance
+from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.geometry.local_frame import mean_distance
 
 
 class Frame(NamedTuple):

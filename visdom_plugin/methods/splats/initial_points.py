@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.geometry.cameras import Cameras, look_at_point, mean_distance, project
+from visdom_plugin.geometry.cameras import Cameras, look_at_point, project
+from visdom_plugin.geometry.local_frame import mean_distance
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import Views

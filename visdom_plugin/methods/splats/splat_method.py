@@ -12,7 +12,8 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.errors import SceneError
-from visdom_plugin.geometry.cameras import Cameras, mean_distance, project
+from visdom_plugin.geometry.cameras import Cameras, project
+from visdom_plugin.geometry.local_frame import mean_distance
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.splats.common import scene_extent
