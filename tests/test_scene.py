@@ -23,7 +23,7 @@ def make_views(**fields):
 
 def test_given_masks_carve_as_they_are():
     views = make_views()
-    cameras, masks = views.silhouettes()
+    cameras, masks, _ = views.silhouettes()
     assert cameras is views.cameras and masks is views.masks
     assert [views.mask_origin(i) for i in range(4)] == ["given"] * 4
     assert views.ignored(2) is None
@@ -32,7 +32,7 @@ def test_given_masks_carve_as_they_are():
 @pytest.mark.parametrize("origin", ["missing", "hull", "colour"])
 def test_only_given_masks_carve(origin):
     views = make_views(mask_origins=("given", origin, "given", origin))
-    cameras, masks = views.silhouettes()
+    cameras, masks, _ = views.silhouettes()
     assert torch.equal(cameras.world_from_camera, views.cameras.world_from_camera[[0, 2]])
     assert len(masks) == 2 and torch.equal(masks[1], views.masks[2])
 
@@ -41,7 +41,7 @@ def test_an_unknown_pixel_may_be_object():
     ignore = torch.zeros(6, 8, dtype=torch.bool)
     ignore[2:4] = True
     views = make_views(ignore=(None, ignore, None, None))
-    _, masks = views.silhouettes()
+    _, masks, _ = views.silhouettes()
     assert masks[1][2:4].all() and torch.equal(masks[1][4:], views.masks[1][4:])
     assert masks[0] is views.masks[0]
 

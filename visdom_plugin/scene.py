@@ -95,16 +95,22 @@ class Views:
         cameras = self.cameras.relative_to(origin)
         return replace(self, cameras=cameras, origin=self.origin + origin, points=points)
 
-    def silhouettes(self) -> tuple[Cameras, Sequence[Tensor]]:
-        """What may carve: the cameras and masks of the views whose mask was given.
+    def demanded(self, index: int) -> Tensor:
+        """(H, W) bool of one view: the pixels that are known to show the object."""
+        ignored = self.ignored(index)
+        return self.masks[index] if ignored is None else self.masks[index] & ~ignored
 
-        An ignored pixel may be object for all one knows, so it counts as foreground here.
+    def silhouettes(self) -> tuple[Cameras, Sequence[Tensor], Sequence[Tensor | None]]:
+        """What may carve: the cameras, masks and ignored pixels of the views whose mask was given.
+
+        An ignored pixel may be object for all one knows: it is True in the mask here and rules nothing out, and
+        the third tells it apart, so that it asks for nothing.
 
         Raises:
             SceneError: no view has a mask.
         """
         if not self.mask_origins and not self.ignore:
-            return self.cameras, self.masks
+            return self.cameras, self.masks, ()
         given = [i for i in range(len(self)) if self.mask_origin(i) == "given"]
         if not given:
             raise SceneError(
@@ -117,7 +123,7 @@ class Views:
         masks = [
             self.masks[i] if g is None else self.masks[i] | g for i, g in zip(given, ignored, strict=True)
         ]
-        return self.cameras[given], masks
+        return self.cameras[given], masks, ignored if any(g is not None for g in ignored) else ()
 
 
 @dataclass(frozen=True)

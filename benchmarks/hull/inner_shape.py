@@ -53,7 +53,7 @@ def main() -> None:
         hull = domain.carve(*scene.train.silhouettes())
         shapes = {"hull": hull}
         for radius in options.radius:
-            inner = shape_inside(hull, *scene.train.silhouettes(), InsideConfig(radius=radius))
+            inner = shape_inside(hull, *scene.train.silhouettes(), config=InsideConfig(radius=radius))
             shapes[f"R = {radius:g}"] = inner
         for name, shape in shapes.items():
             train, covered = fit(shape, scene.train)

@@ -15,7 +15,7 @@ import torch
 from visdom_plugin.figures.canvas import Canvas
 from visdom_plugin.hull.carving.carve import carve_silhouettes
 from visdom_plugin.hull.carving.votes import gather_silhouettes
-from visdom_plugin.hull.checks.distance_fields import draw_outlines
+from visdom_plugin.hull.checks.distance_fields import draw_outlines, is_known
 from visdom_plugin.hull.checks.silhouette_consistency import TOLERANCE_PX, march_rays
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
@@ -101,9 +101,13 @@ def _hulls_of_others(
         wide = torch.full_like(rest.width, _CELL)
         small = rest.resized(wide, (rest.height * _CELL / rest.width).round().clamp_min(1).long())
         shrunk = [_shrink(np.asarray(masks[usable[i]]), small[k]) for k, i in enumerate(others)]
+        unknown = [
+            None if (g := views.ignored(usable[i])) is None else _shrink(np.asarray(g), small[k])
+            for k, i in enumerate(others)
+        ]
         # The view itself is one of the K that see a point.
         rule = replace(domain, k=max(1, min(k - 1, len(others))))
-        hull = carve_silhouettes(rule, small, gather_silhouettes(small, shrunk))
+        hull = carve_silhouettes(rule, small, gather_silhouettes(small, shrunk, unknown))
         camera = views.cameras[view]
         height = max(1, round(int(camera.height) * _CELL / int(camera.width)))
         if hull is None:
@@ -120,7 +124,8 @@ def _contradicted(views: Views, masks: Sequence[Tensor | np.ndarray], found: Che
     sizes = torch.stack([views.cameras.height, views.cameras.width], -1).tolist()
     shown = [i for i, m in enumerate(masks) if list(m.shape) == sizes[i] and m.any()]
     cameras = views.cameras[torch.tensor(shown)]
-    outlines = draw_outlines(cameras, gather_silhouettes(cameras, [masks[i] for i in shown]))
+    unknown = [views.ignored(i) for i in shown]
+    outlines = draw_outlines(cameras, gather_silhouettes(cameras, [masks[i] for i in shown], unknown))
     result = {}
     for at, view in enumerate(shown):
         index = np.array([k for k, i in enumerate(shown) if i in found.usable or i == view])
@@ -128,7 +133,7 @@ def _contradicted(views: Views, masks: Sequence[Tensor | np.ndarray], found: Che
             continue
         field = outlines.fields[at]
         # Every other pixel is enough for a picture.
-        row, column = np.nonzero(field[::2, ::2] < 0)
+        row, column = np.nonzero(((field < 0) & is_known(field))[::2, ::2])
         uv = np.stack([2 * column + 0.5, 2 * row + 0.5], -1)
         whose = np.full(len(uv), int(np.flatnonzero(index == at)[0]))
         rays = march_rays(outlines.keep(index), whose, uv, least=1, ball=found.fit.ball)

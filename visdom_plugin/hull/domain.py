@@ -9,6 +9,11 @@ from typing import TYPE_CHECKING
 from visdom_plugin.hull.settings import HullSettings
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+    from torch import Tensor
+
     from visdom_plugin.geometry.cameras import Cameras
     from visdom_plugin.hull.carving.votes import Masks
     from visdom_plugin.hull.hull import Hull
@@ -37,7 +42,9 @@ class VisibleDomain(HullSettings):
     The settings are the fields of `HullSettings`.
     """
 
-    def carve(self, cameras: Cameras, masks: Masks) -> Hull:
+    def carve(
+        self, cameras: Cameras, masks: Masks, ignore: Sequence[Tensor | np.ndarray | None] = ()
+    ) -> Hull:
         """Carves the hull.
 
         Masks on a CUDA device are voted there voxel by voxel; all others are carved block by block on the CPU,
@@ -46,6 +53,8 @@ class VisibleDomain(HullSettings):
         Args:
             cameras: (N,) Cameras.
             masks: N tensors or arrays (H, W) bool, True on the object, or one (N, H, W).
+            ignore: N tensors or arrays (H, W) bool or None, True where nothing is known, or empty. Such a pixel
+                rules nothing out and asks for nothing.
 
         Returns:
             Hull. Its summary tells rule, bounds, pieces and seconds.
@@ -66,7 +75,7 @@ class VisibleDomain(HullSettings):
         from visdom_plugin.hull.checks.wording import wording
 
         log.info("carving the hull (its kernels are compiled once per machine, which takes 10 to 30 s)")
-        silhouettes = gather_silhouettes(cameras, masks, self.dilate_px)
+        silhouettes = gather_silhouettes(cameras, masks, ignore, dilate_px=self.dilate_px)
         if stand_at_one_point(cameras):
             from visdom_plugin.hull.checks.explain_failure import explain_one_point
 
@@ -98,7 +107,8 @@ class VisibleDomain(HullSettings):
                 "larger k or explicit bounds would close it",
                 *hull.bounds.round(4).tolist(),
             )
-        inverted = [i for i in range(len(silhouettes)) if look_inverted(silhouettes.mask(i))]
+        known = silhouettes.demanding()
+        inverted = [i for i in range(len(known)) if look_inverted(known.mask(i), silhouettes.unknown_in(i))]
         if 2 * len(inverted) > len(silhouettes):
             log.warning(
                 "%d of %d masks are foreground along most of the image's border: they may mark the background; %s",

@@ -42,7 +42,7 @@ def refuse_empty(method: Renderer, views: Views, device: torch.device, where: Pa
     """
     count = min(len(views), LOOKED_AT)
     for i in sorted({round(j * (len(views) - 1) / max(count - 1, 1)) for j in range(count)}):
-        area = int(views.masks[i].sum())
+        area = int(views.demanded(i).sum())
         if views.mask_origin(i) != "given" or not area:
             continue
         _, alpha = render_on_white(method, _shrunk(views.cameras[i], (OBJECT_PX / area) ** 0.5), device)

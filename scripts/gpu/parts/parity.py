@@ -64,7 +64,7 @@ def votes(bench: Bench) -> dict:
 
 
 def carve(bench: Bench) -> dict:
-    cameras, masks = subjects.built_in(bench.size(200, 40)).train.silhouettes()
+    cameras, masks, _ = subjects.built_in(bench.size(200, 40)).train.silhouettes()
     domain = project.VisibleDomain(resolution=bench.size(128, 24))
     here = domain.carve(cameras, masks)
     there = domain.carve(cameras.to(bench.device), [torch.as_tensor(m).to(bench.device) for m in masks])

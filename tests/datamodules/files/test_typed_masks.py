@@ -112,7 +112,7 @@ def test_the_folder_ignore_is_unknown_and_not_background(tiny, folder):
     assert torch.equal(train.ignored(2), torch.from_numpy(unknown) > 0)
     assert all(map(torch.equal, train.masks, tiny.train.masks)), "the foreground is another matter"
     assert "1 views with ignored pixels" in describe_masks(train)[1]
-    _, carving = train.silhouettes()
+    _, carving, _ = train.silhouettes()
     assert carving[2][10:20, 5:30].all()
     half = load(folder, downscale=2.6).train
     assert half.ignored(2).float().mean() >= train.ignored(2).float().mean(), "unknown in part is unknown"

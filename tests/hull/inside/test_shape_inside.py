@@ -58,7 +58,7 @@ def test_covers_of_every_mask_what_the_hull_covers(views, resolution):
     cameras = ring(views)
     masks = ball_masks(cameras, BALLS)
     hull = carve(cameras, masks)
-    inner = shape_inside(hull, cameras, masks, InsideConfig(resolution=resolution))
+    inner = shape_inside(hull, cameras, masks, config=InsideConfig(resolution=resolution))
     before, after = (measure_coverage(shape, cameras, masks) for shape in (hull, inner))
     for a, b, said in zip(before, after, inner.summary["coverage"], strict=True):
         assert b.covered > a.covered - 0.005
@@ -144,7 +144,9 @@ def test_a_turned_scene_gives_the_turned_shape(capture):
 
 def test_a_larger_radius_rounds_more(capture):
     cameras, masks, hull = capture
-    volumes = [shape_inside(hull, cameras, masks, InsideConfig(radius=r)).voxels for r in (0.1, 0.4, 1.6)]
+    volumes = [
+        shape_inside(hull, cameras, masks, config=InsideConfig(radius=r)).voxels for r in (0.1, 0.4, 1.6)
+    ]
     assert volumes == sorted(volumes, reverse=True) and len(set(volumes)) == 3
 
 

@@ -94,7 +94,7 @@ def test_a_run_keeps_the_shape_and_does_not_search_again(scene, searches, tmp_pa
     assert searches == [InsideConfig(radius=1.5)]
     assert record["config"]["initial_shape"] == "inside" and record["config"]["inside"]["radius"] == 1.5
     hull, inner = (Hull.load(tmp_path / "hull" / name) for name in ("hull.npz", "inside.npz"))
-    assert inner == shape.shape_inside(hull, *scene.train.silhouettes(), config.inside)
+    assert inner == shape.shape_inside(hull, *scene.train.silhouettes(), config=config.inside)
     assert (tmp_path / "hull" / "inside.ply").is_file()
     path = tmp_path / "run.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"status": "interrupted"}))

@@ -128,15 +128,15 @@ def find_briefly(scene: Scene) -> list[dict[str, Any]]:
 
 
 def carving_views(views: Views) -> tuple[Views, list]:
-    """The views whose masks were given, and these masks with ignored pixels as foreground."""
+    """The views whose masks were given, and these masks: True on what is known to be object."""
     from visdom_plugin.scene import Views
 
     given = [i for i in range(len(views)) if views.mask_origin(i) == "given"]
-    cameras, masks = views.silhouettes()
+    cameras, masks, ignore = views.silhouettes()
     images = [views.images[i] for i in given]
     names = [views.names[i] for i in given]
-    masks = list(masks)
-    return Views(cameras, images, masks, names), masks
+    chosen = Views(cameras, images, masks, names, ignore=ignore)
+    return chosen, [chosen.demanded(i) for i in range(len(chosen))]
 
 
 def check_views(
@@ -148,7 +148,9 @@ def check_views(
 
     images = () if brief else views.images
     poses = pose_faults(layout)
-    return check(views.cameras, masks, images, views.names, k=k, brief=brief, poses=poses)
+    return check(
+        views.cameras, masks, images, views.names, ignore=views.ignore, k=k, brief=brief, poses=poses
+    )
 
 
 def describe_check(found: Check, names: Sequence[str], *, inverted: bool = False) -> dict[str, Any]:

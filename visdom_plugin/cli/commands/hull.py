@@ -120,14 +120,15 @@ def report_hull(
     from visdom_plugin.scene import describe_masks
 
     views = scene.train
-    cameras, silhouettes = views.silhouettes()
-    names = [n for i, n in enumerate(views.names) if views.mask_origin(i) == "given"]
-    hull = outer = domain.carve(cameras, silhouettes)
+    cameras, silhouettes, ignore = views.silhouettes()
+    given = [i for i in range(len(views)) if views.mask_origin(i) == "given"]
+    names, known = [views.names[i] for i in given], [views.demanded(i) for i in given]
+    hull = outer = domain.carve(cameras, silhouettes, ignore)
     if inside:
         from visdom_plugin.hull.inside.shape import shape_inside
 
-        hull = shape_inside(outer, cameras, silhouettes)
-    coverage = measure_coverage(hull, cameras, silhouettes)
+        hull = shape_inside(outer, cameras, silhouettes, ignore)
+    coverage = measure_coverage(hull, cameras, silhouettes, ignore)
     summary = hull.summary
     report = {
         "scene": scene.name,
@@ -148,7 +149,7 @@ def report_hull(
         "bounds_closed": summary["bounds_closed"],
         "coverage": {n: round(c.covered, 6) for n, c in zip(names, coverage, strict=True)},
         "inside_mask": {n: round(c.inside, 6) for n, c in zip(names, coverage, strict=True)},
-        "touches_border": [n for n, m in zip(names, silhouettes, strict=True) if border_share(m.numpy()) > 0],
+        "touches_border": [n for n, m in zip(names, known, strict=True) if border_share(m.numpy()) > 0],
         "components": summary["components"],
         "components_found": summary["components_found"],
         "components_dropped": summary["components_dropped"],

@@ -16,7 +16,7 @@ import numpy as np
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.hull.carving.keep_rule import KeepRule
-from visdom_plugin.hull.carving.octree import Areas
+from visdom_plugin.hull.carving.octree import Areas, sum_areas
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes, axis_terms
 from visdom_plugin.hull.grid.components import Pieces
 
@@ -76,6 +76,10 @@ def explaining_pieces(
     """
     if len(pieces.sizes) < 2:
         return np.ones(len(pieces.sizes), bool)
+    if silhouettes.unknown is not None:
+        # Pixels at which nothing is known ask for no piece.
+        silhouettes = silhouettes.demanding()
+        areas = sum_areas(silhouettes)
     thin = 2 if max(occupancy.shape) > _FINE else 1
     thin *= 2 if max(occupancy.shape) > 2 * _FINE else 1
     stretch = np.where(pieces.sizes >= _LARGE, thin, 1)

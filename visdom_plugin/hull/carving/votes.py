@@ -8,7 +8,7 @@ in float64 and in one order, which `octree` repeats, so that both agree voxel fo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -60,7 +60,9 @@ class Silhouettes:
     offsets: np.ndarray
     """(N,) int64 where each mask starts in `pixels`."""
     pixels: np.ndarray
-    """All masks one after the other, row by row, uint8 0 or 1."""
+    """All masks one after the other, row by row, uint8 0 or 1; 1 where nothing is known."""
+    unknown: np.ndarray | None = None
+    """The same of pixels at which nothing is known, or None where all are."""
 
     def __len__(self) -> int:
         return len(self.sizes)
@@ -70,13 +72,26 @@ class Silhouettes:
         (width, height), start = self.sizes[view], self.offsets[view]
         return self.pixels[start : start + width * height].reshape(height, width)
 
+    def unknown_in(self, view: int) -> np.ndarray | None:
+        """(H, W) bool of one view, True where nothing is known; None where all is known in every view."""
+        return None if self.unknown is None else replace(self, pixels=self.unknown).mask(view).astype(bool)
 
-def gather_silhouettes(cameras: Cameras, masks: Masks, dilate_px: int = 0) -> Silhouettes:
+    def demanding(self) -> Silhouettes:
+        """Only what is known to be object: what a hull has to explain."""
+        if self.unknown is None:
+            return self
+        return replace(self, pixels=self.pixels & (1 - self.unknown), unknown=None)
+
+
+def gather_silhouettes(
+    cameras: Cameras, masks: Masks, ignore: Sequence[Tensor | np.ndarray | None] = (), *, dilate_px: int = 0
+) -> Silhouettes:
     """Checks and packs cameras and masks.
 
     Args:
         cameras: (N,) cameras.
         masks: N tensors or arrays (H, W), True on the object; or one (N, H, W).
+        ignore: N tensors or arrays (H, W) bool or None, True where nothing is known; or empty.
         dilate_px: grow each mask by a square of 2 * dilate_px + 1 pixels.
 
     Raises:
@@ -94,6 +109,7 @@ def gather_silhouettes(cameras: Cameras, masks: Masks, dilate_px: int = 0) -> Si
     counts = sizes.prod(1)
     offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
     pixels = np.empty(int(counts.sum()), np.uint8)
+    unknown = np.zeros_like(pixels) if any(g is not None for g in ignore) else None
     for view, mask in enumerate(masks):
         mask = to_numpy(mask)
         width, height = sizes[view]
@@ -110,12 +126,24 @@ def gather_silhouettes(cameras: Cameras, masks: Masks, dilate_px: int = 0) -> Si
                 todo="threshold it first: mask > 0.5, or mask > 127",
             )
         mask = mask.astype(np.uint8)
+        part = slice(offsets[view], offsets[view] + counts[view])
+        ignored = ignore[view] if ignore else None
+        if unknown is not None and ignored is not None:
+            if tuple(ignored.shape) != mask.shape:
+                raise SceneError(
+                    f"ignored pixels {view} have shape {tuple(ignored.shape)}, the mask has {mask.shape}",
+                    where=f"view {view}",
+                )
+            unknown[part] = to_numpy(ignored).reshape(-1) > 0
+            mask &= 1 - unknown[part].reshape(mask.shape)
         if dilate_px:
             import cv2
 
             mask = cv2.dilate(mask, np.ones((2 * dilate_px + 1,) * 2, np.uint8))
-        pixels[offsets[view] : offsets[view] + counts[view]] = mask.reshape(-1)
-    return Silhouettes(np.ascontiguousarray(projections), sizes, offsets, pixels)
+        pixels[part] = mask.reshape(-1)
+    if unknown is not None:
+        pixels |= unknown
+    return Silhouettes(np.ascontiguousarray(projections), sizes, offsets, pixels, unknown)
 
 
 def axis_terms(projections: np.ndarray, coordinates: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:

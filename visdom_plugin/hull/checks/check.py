@@ -21,7 +21,7 @@ from visdom_plugin.hull.checks.covisibility import (
     measure_spread,
 )
 from visdom_plugin.hull.checks.degenerate import stand_at_one_point
-from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines, draw_outlines
+from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines, draw_outlines, turn_over
 from visdom_plugin.hull.checks.fault_hypotheses import QUIET_PX, Suspicion, find_causes
 from visdom_plugin.hull.checks.findings import Finding, Name, Sure
 from visdom_plugin.hull.checks.mask_checks import (
@@ -68,6 +68,7 @@ def check(
     images: Sequence[Tensor | np.ndarray] = (),
     names: Sequence[str] | None = None,
     *,
+    ignore: Sequence[Tensor | np.ndarray | None] = (),
     k: int | None = None,
     brief: bool = False,
     poses: PoseFaults = IN_MEMORY,
@@ -79,16 +80,20 @@ def check(
         masks: N tensors or arrays (H, W), True on the object. They need not fit the cameras: that is a finding.
         images: N tensors or arrays (H, W, 3), or empty to leave them out.
         names: the views' names, for the sentences.
+        ignore: N tensors or arrays (H, W) bool or None, True where nothing is known, or empty.
         k: the K that is going to be used; by default it is to be advised.
         brief: a fraction of a second; names a fault but not always its cause, and compares 16 views at most.
         poses: what to say of wrong poses, in the terms of where they are from.
     """
     own = [to_numpy(m).astype(bool) for m in masks]
+    unknown = [None if g is None else to_numpy(g).astype(bool) for g in ignore] or [None] * len(own)
+    own = [_without(m, g) for m, g in zip(own, unknown, strict=True)]
     names = Name.numbered(len(own)) if names is None else Name(names)
     sizes = torch.stack([cameras.width, cameras.height], -1).cpu().numpy()
     found = check_sizes(sizes, own, names)
     out = {view for f in found for view in f.views}
-    alone = check_content([m if i not in out else np.eye(2, dtype=bool) for i, m in enumerate(own)], names)
+    filled = [_filled(m, g) for m, g in zip(own, unknown, strict=True)]
+    alone = check_content([m if i not in out else np.eye(2, dtype=bool) for i, m in enumerate(filled)], names)
     found += alone
     for f in alone:
         if f.kind == "speckled":
@@ -105,11 +110,14 @@ def check(
         notes, found = _split([*found, *repeated])
         return Check(found, notes, None, None, tuple(usable.tolist()))
     chosen = cameras[torch.from_numpy(usable)]
-    outlines = draw_outlines(chosen, gather_silhouettes(chosen, [own[i] for i in usable]))
-    inverted, outlines = _inverted(outlines, own, usable, names)
+    outlines = draw_outlines(
+        chosen, gather_silhouettes(chosen, [own[i] for i in usable], [unknown[i] for i in usable])
+    )
+    inverted, outlines = _inverted(outlines, own, unknown, usable, names)
     found += inverted
     turned = {v for f in inverted for v in f.views}
-    found += check_border([m if i not in turned else ~m for i, m in enumerate(own)], names)
+    turned_over = [_without(~m, unknown[i]) if i in turned else m for i, m in enumerate(own)]
+    found += check_border(turned_over, names)
     causes, fit, left = find_causes(outlines, brief=brief, poses=poses)
     if stand_at_one_point(chosen) and not any(c.kind == "axes" for c in causes):
         notes, found = _split([*found, *repeated, _one_point(len(chosen))])
@@ -136,6 +144,17 @@ def check(
     notes, found = _split(found)
     found.sort(key=lambda f: ("certain", "likely", "possible").index(f.sure))
     return Check(found, notes, advice, fit, tuple(usable[left].tolist()))
+
+
+def _without(mask: np.ndarray, unknown: np.ndarray | None) -> np.ndarray:
+    """What is known to be object."""
+    return mask if unknown is None or unknown.shape != mask.shape else mask & ~unknown
+
+
+def _filled(mask: np.ndarray, unknown: np.ndarray | None) -> np.ndarray:
+    """The mask; all foreground where all that is known is."""
+    full = unknown is not None and unknown.shape == mask.shape and mask.any() and (mask | unknown).all()
+    return np.ones_like(mask) if full else mask
 
 
 def _split(found: list[Finding]) -> tuple[list[Finding], list[Finding]]:
@@ -175,15 +194,19 @@ def _repeated(
 
 
 def _inverted(
-    outlines: Outlines, masks: Sequence[np.ndarray], usable: np.ndarray, names: Name
+    outlines: Outlines,
+    masks: Sequence[np.ndarray],
+    unknown: Sequence[np.ndarray | None],
+    usable: np.ndarray,
+    names: Name,
 ) -> tuple[list[Finding], Outlines]:
     """Masks that hold the border of their image, and fit the others no worse when turned over."""
-    flagged = [k for k, i in enumerate(usable) if look_inverted(masks[i])]
+    flagged = [k for k, i in enumerate(usable) if look_inverted(masks[i], unknown[i])]
     if not flagged:
         return [], outlines
     rays = max(_RAYS // len(usable), 16)
     fit = measure_coherence(outlines, rays)
-    fields = tuple(-f if k in flagged else f for k, f in enumerate(outlines.fields))
+    fields = tuple(turn_over(f) if k in flagged else f for k, f in enumerate(outlines.fields))
     turned = replace(outlines, fields=fields)
     after = measure_coherence(turned, rays)
     # A close-up fills its border as well, but it fits as it is and not when turned over.

@@ -40,17 +40,28 @@ class Coverage(NamedTuple):
     """Share of the hull's silhouette that lies on the mask; 1 where the hull is not seen."""
 
 
-def measure_coverage(hull: Hull, cameras: Cameras, masks: Sequence[Tensor | np.ndarray]) -> list[Coverage]:
+def measure_coverage(
+    hull: Hull,
+    cameras: Cameras,
+    masks: Sequence[Tensor | np.ndarray],
+    ignore: Sequence[Tensor | np.ndarray | None] = (),
+) -> list[Coverage]:
     """Coverage of each mask, by casting a ray through every pixel.
 
     Args:
         cameras: (N,) cameras.
         masks: N tensors or arrays (H, W), True on the object.
+        ignore: N tensors or arrays (H, W) bool or None, True where nothing is known, or empty: such pixels do not
+            count.
     """
     result = []
     for view, mask in enumerate(masks):
         seen = depth_and_silhouette(hull, cameras[view].to("cpu"))[1].numpy()
         mask = to_numpy(mask).astype(bool)
+        ignored = ignore[view] if ignore else None
+        if ignored is not None:
+            known = ~to_numpy(ignored).astype(bool)
+            seen, mask = seen & known, mask & known
         both, of_mask, of_hull = (int(np.count_nonzero(x)) for x in (seen & mask, mask, seen))
         result.append(Coverage(both / of_mask if of_mask else 1.0, both / of_hull if of_hull else 1.0))
     return result
@@ -80,10 +91,11 @@ def estimate_coverage(hull: Hull, cameras: Cameras, silhouettes: Silhouettes) ->
     Args:
         cameras: (N,) on the CPU.
     """
+    known = silhouettes.demanding()
     count = max(_RAYS // len(silhouettes), 16)
     shares = []
     for view in range(len(silhouettes)):
-        foreground = np.flatnonzero(silhouettes.mask(view))
+        foreground = np.flatnonzero(known.mask(view))
         if not len(foreground):
             continue
         chosen = foreground[(np.arange(count) + 0.5).astype(int) * len(foreground) // count]

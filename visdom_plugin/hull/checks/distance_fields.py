@@ -17,6 +17,8 @@ OBJECT_PX = 128
 MOST_PX = 512
 """Pixels along the longest side of a field, for objects that are small in the frame."""
 _FAR = 1e6
+_UNKNOWN = -1e7
+"""Value of a field where nothing is known: as far inside as can be, so that it rules nothing out."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,8 @@ class Outlines:
     intrinsics: np.ndarray
     """(N, 3, 3) float64 in the fields' pixels."""
     fields: tuple[np.ndarray, ...]
-    """N arrays (h, w) float32: pixels from each pixel's centre to the mask's outline, negative inside."""
+    """N arrays (h, w) float32: pixels from each pixel's centre to the mask's outline, negative inside and where
+    nothing is known (see `is_known`)."""
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -66,18 +69,34 @@ def draw_outlines(cameras: Cameras, silhouettes: Silhouettes) -> Outlines:
         cameras: (N,) the ones of `silhouettes`.
     """
     sides = silhouettes.sizes.max(1)
-    lengths = np.array([object_length(silhouettes.mask(view)) for view in range(len(silhouettes))]) / sides
+    known = silhouettes.demanding()
+    lengths = np.array([object_length(known.mask(view)) for view in range(len(known))]) / sides
     longest = min(OBJECT_PX / float(np.median(lengths[lengths > 0])), MOST_PX) if lengths.any() else OBJECT_PX
     fields, ratios = [], []
     for view in range(len(silhouettes)):
         mask = silhouettes.mask(view)
         factor = min(1.0, longest / sides[view])
         width, height = (max(1, round(s * factor)) for s in silhouettes.sizes[view].tolist())
-        fields.append(signed_distance(_shrink(mask, width, height)))
+        field, unknown = signed_distance(_shrink(mask, width, height)), silhouettes.unknown_in(view)
+        if unknown is not None:
+            # What is unknown in part is unknown.
+            share = cv2.resize(unknown.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+            field[share > 0] = _UNKNOWN
+        fields.append(field)
         ratios.append((width / mask.shape[1], height / mask.shape[0], 1.0))
     motion = cameras.world_from_camera.double().cpu().numpy()
     scaled = cameras.intrinsics.double().cpu().numpy() * np.array(ratios)[:, :, None]
     return Outlines(motion[:, :3, :3].copy(), motion[:, :3, 3].copy(), scaled, tuple(fields))
+
+
+def is_known(field: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the pixels of a field that say something."""
+    return field > -2 * _FAR
+
+
+def turn_over(field: np.ndarray) -> np.ndarray:
+    """The field of the inverted mask; what is unknown stays so."""
+    return np.where(is_known(field), -field, field)
 
 
 def _shrink(mask: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -123,10 +123,10 @@ def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouett
 
 def _faults(settings: HullSettings, cameras: Cameras, silhouettes: Silhouettes) -> list[Finding]:
     """Findings of the check that can empty a hull, most serious first, one of each kind."""
-    masks = [silhouettes.mask(i) for i in range(len(silhouettes))]
+    masks, ignore = _known(silhouettes)
     rule = KeepRule.of(settings, len(silhouettes))
     asked = rule.least_visible if settings.kind == "visdom" else None
-    found = check(cameras, masks, k=asked)
+    found = check(cameras, masks, ignore=ignore, k=asked)
     groups: dict[str, list[Finding]] = {}
     for f in found.findings:
         # Equal masks that fit the others are those of a symmetric object.
@@ -161,9 +161,15 @@ def _todo(fault: Finding) -> str:
     return fault.todo + tells
 
 
+def _known(silhouettes: Silhouettes) -> tuple[list[np.ndarray], list[np.ndarray | None]]:
+    """Masks of what is known to be object, and the pixels at which nothing is known."""
+    known, views = silhouettes.demanding(), range(len(silhouettes))
+    return [known.mask(i) for i in views], [silhouettes.unknown_in(i) for i in views]
+
+
 def _mean_coverage(hull: Hull, cameras: Cameras, silhouettes: Silhouettes) -> float:
-    masks = [silhouettes.mask(i) for i in range(len(silhouettes))]
-    seen = measure_coverage(hull, cameras, masks)
+    masks, ignore = _known(silhouettes)
+    seen = measure_coverage(hull, cameras, masks, ignore)
     shares = [c.covered for c, mask in zip(seen, masks, strict=True) if mask.any()]
     return float(np.mean(shares)) if shares else 1.0
 

@@ -121,9 +121,19 @@ def border_share(mask: np.ndarray) -> float:
     return float(_ring(mask).astype(bool).mean())
 
 
-def look_inverted(mask: np.ndarray) -> bool:
-    """Whether most of the image's border is foreground, as in a mask that marks the background."""
-    return border_share(mask) > _INVERTED_BORDER
+def look_inverted(mask: np.ndarray, unknown: np.ndarray | None = None) -> bool:
+    """Whether most of the image's border is foreground, as in a mask that marks the background.
+
+    Args:
+        mask: (H, W).
+        unknown: (H, W) bool, True where nothing is known: what lies beside such pixels is border as well.
+    """
+    if unknown is None:
+        return border_share(mask) > _INVERTED_BORDER
+    out = np.pad(unknown, 1, constant_values=True)
+    beside = out[:-2, 1:-1] | out[2:, 1:-1] | out[1:-1, :-2] | out[1:-1, 2:]
+    rim = mask[beside & ~unknown]
+    return bool(len(rim)) and float(rim.astype(bool).mean()) > _INVERTED_BORDER
 
 
 def _ring(mask: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
-from visdom_plugin.hull.checks.distance_fields import Outlines
+from visdom_plugin.hull.checks.distance_fields import Outlines, is_known
 
 CAP_PX = 16.0
 """Residuals are cut off here: beyond it, wrong is wrong."""
@@ -173,7 +173,10 @@ def choose_pixels(
         if beside:
             groups = (np.flatnonzero((field > _BESIDE_PX[0]) & (field < _BESIDE_PX[1])),)
         else:
-            groups = (np.flatnonzero((field < 0) & (field > -2)), np.flatnonzero(field <= -2))
+            groups = (
+                np.flatnonzero((field < 0) & (field > -2)),
+                np.flatnonzero((field <= -2) & is_known(field)),
+            )
         for group in groups:
             count = min(len(group), per_view // len(groups))
             if count == 0:

@@ -29,13 +29,16 @@ _BALL = 3.0
 would go on shrinking past it, and nothing but sheets of such voxels would stay."""
 
 
-def shape_inside(hull: Hull, cameras: Cameras, masks: Sequence, config: InsideConfig | None = None) -> Hull:
+def shape_inside(
+    hull: Hull, cameras: Cameras, masks: Sequence, ignore: Sequence = (), config: InsideConfig | None = None
+) -> Hull:
     """The smoothest full shape inside a hull that covers of the masks what the hull covers; see `InsideConfig`.
 
     Args:
         hull: carved from these cameras and masks.
         cameras: (N,) cameras.
         masks: N tensors or arrays (H, W), True on the object.
+        ignore: N tensors or arrays (H, W) bool or None, True where nothing is known, or empty.
 
     Returns:
         A Hull on the hull's own grid, each of its voxels one of the hull's. Its summary is the hull's with kind
@@ -48,7 +51,7 @@ def shape_inside(hull: Hull, cameras: Cameras, masks: Sequence, config: InsideCo
         SceneError: masks do not fit the cameras.
     """
     config = config or InsideConfig()
-    silhouettes = gather_silhouettes(cameras, masks)
+    silhouettes = gather_silhouettes(cameras, masks, ignore).demanding()
     _check(hull, len(silhouettes))
     began = time.perf_counter()
     box = occupied_box(hull.occupancy)

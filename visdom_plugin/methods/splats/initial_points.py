@@ -64,7 +64,7 @@ def mean_masked_colour(points: Tensor, views: Views) -> Tensor:
     total = torch.zeros(len(points), 3)
     for i in range(len(views)):
         uv, depth = project(views.cameras[i].to(dtype=torch.float32), points.float())
-        image = views.images[i].float() / 255 * views.masks[i][..., None]
+        image = views.images[i].float() / 255 * views.demanded(i)[..., None]
         height, width = image.shape[:2]
         grid = 2 * uv / uv.new_tensor([width, height]) - 1
         sampled = torch.nn.functional.grid_sample(

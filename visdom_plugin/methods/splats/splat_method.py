@@ -110,7 +110,7 @@ def refuse_unseen(means: Tensor, views: Views, near: float) -> None:
         uv, depth = project(camera, means.cpu().double())
         size = torch.stack([camera.width, camera.height])
         near_picture = (uv > -SEEN_MARGIN * size) & (uv < (1 + SEEN_MARGIN) * size)
-        if not bool(((depth > near) & near_picture.all(-1)).any()) and bool(views.masks[i].any()):
+        if not bool(((depth > near) & near_picture.all(-1)).any()) and bool(views.demanded(i).any()):
             raise SceneError(
                 f"nothing is drawn in training view {name}: none of the {len(means)} Gaussians lies before it",
                 cause="a pose that looks away from the object, or points to start from that are in another frame",

@@ -45,7 +45,7 @@ def _find_inner(config: Any, hull: Hull, views: Views, saved: Path | None) -> Hu
         from visdom_plugin.hull.inside.shape import shape_inside
 
         try:
-            inner = shape_inside(hull, *views.silhouettes(), config.inside)
+            inner = shape_inside(hull, *views.silhouettes(), config=config.inside)
         except ConfigError as error:
             log.warning("the Gaussians start in the hull, not in the shape inside it: %s", error.what)
     return inner
