@@ -19,6 +19,8 @@ MOST_PX = 512
 _FAR = 1e6
 _UNKNOWN = -1e7
 """Value of a field where nothing is known: as far inside as can be, so that it rules nothing out."""
+UNKNOWN_BELOW = -2 * _FAR
+"""Values below, also interpolated ones, are of what is unknown: there a view sees nothing."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def draw_outlines(cameras: Cameras, silhouettes: Silhouettes) -> Outlines:
 
 def is_known(field: np.ndarray) -> np.ndarray:
     """(h, w) bool: the pixels of a field that say something."""
-    return field > -2 * _FAR
+    return field > UNKNOWN_BELOW
 
 
 def turn_over(field: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
-from visdom_plugin.hull.checks.distance_fields import Outlines, is_known
+from visdom_plugin.hull.checks.distance_fields import UNKNOWN_BELOW, Outlines, is_known
 
 CAP_PX = 16.0
 """Residuals are cut off here: beyond it, wrong is wrong."""
@@ -116,7 +116,6 @@ def _follow_rays(
                 width, height = sizes[j]
                 if u < 0 or v < 0 or u >= width or v >= height:
                     continue
-                seen += 1
                 speed = max(speed, rate[j] / (w * w))
                 # Bilinear between pixel centres.
                 a, b = min(max(u - 0.5, 0.0), width - 1.0), min(max(v - 0.5, 0.0), height - 1.0)
@@ -127,6 +126,9 @@ def _follow_rays(
                 value = (1 - b) * ((1 - a) * fields[at] + a * fields[at + right]) + b * (
                     (1 - a) * fields[at + down] + a * fields[at + down + right]
                 )
+                if value < UNKNOWN_BELOW:
+                    continue
+                seen += 1
                 if value > first:
                     first, second, worst = value, first, j
                 elif value > second:
