@@ -208,7 +208,7 @@ K = np.array([[110.0, 0, 52.5], [0, 115.0, 37.0], [0, 0, 1]])
         (np.diag([1 / 100, 1 / 80, 1]) @ K, "fractions(.|\n)*first row by the width"),
         (
             np.array([[110, 0, 0.525], [0, 115, 0.46], [0, 0, 1]]),
-            "centre left at 0(.|\n)*cx near width",
+            "centre left at 0(.|\n)*cx about width",
         ),
         (np.diag([110, 115, 1]), "left at 0"),
         (np.array([[0.85, 0, 50], [0, 0.68, 40], [0, 0, 1]]), "an angle"),
