@@ -125,7 +125,7 @@ def test_meshes_are_exported_where_the_capture_is(scene, far, tmp_path):
     for here in (scene, moved(scene, far)):
         method, hull, _ = begin("ingp+vd", here)
         inner = getattr(method, "method", method)
-        inner._density = lambda points: 100.0 * (points.norm(dim=-1) < 0.3)
+        inner.density = lambda points: 100.0 * (points.norm(dim=-1) < 0.3)
         inner.occupancy.is_occupied = lambda points: torch.ones(len(points), dtype=torch.bool)
         (path,) = export(method, tmp_path)
         mesh = trimesh.load(path, process=False)

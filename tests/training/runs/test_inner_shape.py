@@ -116,5 +116,7 @@ def test_where_there_is_no_such_shape_the_log_says_why_and_the_hull_is_the_start
         assert hull.inner is None
         starts.append(method.splats.means)
     assert torch.equal(*starts)
-    said = [r.message for r in caplog.records if "start in the hull, not in the shape inside it" in r.message]
+    said = [
+        r.message for r in caplog.records if "goes by the hull alone, not by the shape inside it" in r.message
+    ]
     assert len(said) == 1 and why in said[0]

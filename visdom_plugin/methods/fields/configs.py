@@ -6,12 +6,30 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from visdom_plugin.hooks.configs import SamplerMethodConfig
+from visdom_plugin.hull.inside.config import InsideConfig
 from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 from visdom_plugin.validation import demand
 
 
+@dataclass(frozen=True, kw_only=True)
+class FieldConfig(SamplerMethodConfig):
+    """What all radiance fields take."""
+
+    prior_weight: float = 0.0
+    """Weight of the mean opacity in the hull beside the smoothest full shape inside it that has its silhouettes, a
+    soft prior that space is empty there. Needs a hull."""
+    inside: InsideConfig = field(default_factory=InsideConfig)
+    """How that shape is found."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        shapeless = self.prior_weight > 0 and self.hull is None
+        fits = self.prior_weight >= 0 and not shapeless
+        demand(self, {"prior_weight": (fits, "0, or more where there is a hull, as in the variant +vd")})
+
+
 @dataclass(frozen=True)
-class IngpConfig(SamplerMethodConfig):
+class IngpConfig(FieldConfig):
     """Instant-NGP (Müller et al. 2022). Lengths are in mean camera distances unless their name says otherwise.
 
     The field fills the cube of half side `half_side` around the training cameras' look-at point.
@@ -90,7 +108,7 @@ class IngpConfig(SamplerMethodConfig):
 
 
 @dataclass(frozen=True)
-class ZipNerfConfig(SamplerMethodConfig):
+class ZipNerfConfig(FieldConfig):
     """Zip-NeRF (Barron et al. 2023) on one device. Lengths are in mean camera distances.
 
     Defaults are the published ones for a single GPU (camp_zipnerf).

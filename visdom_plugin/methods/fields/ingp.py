@@ -80,7 +80,7 @@ class Ingp(RadianceField[IngpConfig]):
         draw = draw_on(self.device, generator(self.seed, "step", step))
         if step % c.occupancy_every == 0:
             fraction = 1.0 if step < c.occupancy_warm_up else c.occupancy_fraction
-            self.occupancy.update(self._density, generator(self.seed, "occupancy", step), fraction=fraction)
+            self.occupancy.update(self.density, generator(self.seed, "occupancy", step), fraction=fraction)
         n = len(batch.mask)
         background = self.draw_background(n, draw)
         rays = self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
@@ -93,6 +93,7 @@ class Ingp(RadianceField[IngpConfig]):
         losses = {"colour": torch.nn.functional.huber_loss(rgb, target, delta=HUBER_DELTA) / HUBER_DELTA}
         if c.mask_weight:
             losses["mask"] = c.mask_weight * silhouette_loss(alpha, batch)
+        losses |= self.prior_losses(step)
         return StepOutput(losses, {"psnr": psnr_of(rgb - target)})
 
     def optimise(self, step: int, output: StepOutput) -> None:
@@ -136,7 +137,7 @@ class Ingp(RadianceField[IngpConfig]):
             there = self.occupancy.is_occupied(points)
             for hook in sample_filters(self.hooks_at_inference()):
                 there &= hook.keep(self.frame.to_world(points))
-            return torch.where(there, self._density(points), 0)
+            return torch.where(there, self.density(points), 0)
 
         half_side = self.config.half_side
         return mesh_density(
@@ -164,7 +165,7 @@ class Ingp(RadianceField[IngpConfig]):
         out = self.density_net(encode(unit, self.table, c.grid))
         return truncated_exp(out[:, 0] + c.density_bias), out[:, 1:]
 
-    def _density(self, points: Tensor) -> Tensor:
+    def density(self, points: Tensor) -> Tensor:
         return self._features(points.to(self.device))[0]
 
     def _colour(self, points: Tensor, directions: Tensor) -> Tensor:

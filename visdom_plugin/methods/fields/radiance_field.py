@@ -15,6 +15,7 @@ from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.fields.common import LocalRays, bound_rays, render_image, spread_rays
 from visdom_plugin.methods.fields.configs import IngpConfig, ZipNerfConfig
+from visdom_plugin.methods.fields.shape_prior import ShapePrior
 from visdom_plugin.nerf.frame import frame_of
 from visdom_plugin.nerf.optimiser import FieldOptimiser
 from visdom_plugin.render import Render
@@ -54,6 +55,9 @@ class RadianceField(ABC, Generic[Config]):
         for hook in self.hooks:
             if isinstance(hook, PixelSampler):
                 hook.follow_pixels(cameras)
+        self.prior: ShapePrior | None = None
+        if self.config.prior_weight > 0 and hull is not None and hull.inner is not None:
+            self.prior = ShapePrior(hull, self.frame)
         self.build(cameras, generator(seed, "field"))
         if device.type == "cpu":
             self._warm_up(views.cameras[0])
@@ -99,6 +103,17 @@ class RadianceField(ABC, Generic[Config]):
     def hooks_at_inference(self) -> list[SamplerHook]:
         """The hooks that bound the rays of novel views."""
         return self.hooks if self.config.vd.hull_at_inference else []
+
+    @abstractmethod
+    def density(self, points: Tensor) -> Tensor:
+        """Density (m,) per unit of the field's frame at points (m, 3) in that frame, on any device."""
+
+    def prior_losses(self, step: int) -> dict[str, Tensor]:
+        """The loss that the shape inside the hull adds, by name; none where it is not asked for."""
+        if self.prior is None:
+            return {}
+        loss = self.prior.loss(self.density, generator(self.seed, "prior", step))
+        return {"prior": self.config.prior_weight * loss}
 
     def draw_background(self, n: int, generator: Generator) -> Tensor:
         """(n, 3) behind the photographs of a training step."""

@@ -157,6 +157,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         if c.hash_decay:
             grids = (self._grid(name).decay() for name in LEVELS)
             losses["hash_decay"] = c.hash_decay * reduce(torch.add, grids)
+        losses |= self.prior_losses(step)
         return StepOutput(losses, {"psnr": psnr_of(error)})
 
     def optimise(self, step: int, output: StepOutput) -> None:
@@ -173,7 +174,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
     def mesh(self, resolution: int = MESH_RESOLUTION) -> FieldMesh | None:
         """The surface in the capture's frame; see `mesh_density`."""
         return mesh_density(
-            self._density, self._colour, self.frame, 1.0, resolution=resolution, origin=self.origin
+            self.density, self._colour, self.frame, 1.0, resolution=resolution, origin=self.origin
         )
 
     def own_bounds(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -256,7 +257,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         std = torch.full_like(points[..., 0], 0.5 / self.config.grid.max_resolution)
         return self.model["field"](points, std)
 
-    def _density(self, points: Tensor) -> Tensor:
+    def density(self, points: Tensor) -> Tensor:
         return truncated_exp(self._field(points)[:, 0] + self.config.density_bias)
 
     def _colour(self, points: Tensor, directions: Tensor) -> Tensor:

@@ -24,8 +24,8 @@ the method's."""
 def find_hull(config: Any, views: Views, saved: Path | None) -> Hull | None:
     """The hull that a method's settings ask for, None where they ask for none.
 
-    With `initial_shape` "inside" it has the shape inside as `hull.inner`; where that cannot be had, the log says
-    why and the Gaussians start in the hull.
+    With `initial_shape` "inside", or a `prior_weight`, it has the shape inside as `hull.inner`; where that cannot
+    be had, the log says why, and Gaussians start in the hull, fields have no prior.
 
     Args:
         saved: the folder in which the run keeps its hulls, if it has one: what is there is read, not carved again.
@@ -34,7 +34,7 @@ def find_hull(config: Any, views: Views, saved: Path | None) -> Hull | None:
         return None
     hull = read_hull(saved / HULL) if saved is not None else None
     hull = config.hull.carve(*views.silhouettes()) if hull is None else hull
-    if getattr(config, "initial_shape", "hull") == "inside":
+    if getattr(config, "initial_shape", "hull") == "inside" or getattr(config, "prior_weight", 0) > 0:
         hull = replace(hull, inner=_find_inner(config, hull, views, saved))
     return hull
 
@@ -47,7 +47,7 @@ def _find_inner(config: Any, hull: Hull, views: Views, saved: Path | None) -> Hu
         try:
             inner = shape_inside(hull, *views.silhouettes(), config=config.inside)
         except ConfigError as error:
-            log.warning("the Gaussians start in the hull, not in the shape inside it: %s", error.what)
+            log.warning("training goes by the hull alone, not by the shape inside it: %s", error.what)
     return inner
 
 
