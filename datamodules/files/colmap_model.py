@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 import torch
@@ -18,7 +18,7 @@ import torch
 from datamodules.files.parsers import damaged
 from datamodules.files.paths import inside, read_inside
 from datamodules.files.pinholes import pinholes
-from datamodules.files.undistort import COEFFICIENTS, Distortion
+from datamodules.files.undistort import COEFFICIENTS, Distortion, advise_undistorting
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.geometry.rotations import matrix_from_quaternion
@@ -31,10 +31,9 @@ MODELS = {
     12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4),
     16: ("EUCM", 6), 17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
-_ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}
+_ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 """Of the models that can be undistorted, those whose parameters begin f, cx, cy and not fx, fy, cx, cy."""
 _T = TypeVar("_T")
-_UNDISTORT = "undistort: colmap image_undistorter --image_path images --input_path sparse/0 --output_path DIR"
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ def cameras_of(model: Model, images: Sequence[Registered]) -> tuple[Cameras, lis
                 cause="the cameras and images files come from different models, or one is damaged",
                 todo="export both from the same reconstruction",
             )
-        matrix, distortion = _lens(lens, image.name, model.folder)
+        matrix, distortion = _lens(lens, image.name, model)
         K.append(matrix)
         distortions.append(distortion)
         if max(map(abs, image.quaternion)) < 1e-150:
@@ -144,15 +143,15 @@ def cameras_of(model: Model, images: Sequence[Registered]) -> tuple[Cameras, lis
     return cameras, distortions
 
 
-def _lens(lens: Intrinsics, name: str, folder: Path) -> tuple[tuple[float, ...], Distortion | None]:
+def _lens(lens: Intrinsics, name: str, model: Model) -> tuple[tuple[float, ...], Distortion | None]:
     if lens.model not in COEFFICIENTS:
         known = lens.model in dict(MODELS.values())
         raise SceneError(
             f"image {name} has the {'' if known else 'unknown '}lens model {lens.model[:40]}; possible are "
             + ", ".join(COEFFICIENTS),
-            where=folder,
+            where=model.folder,
             cause="the photographs still have their lens distortion" if known else None,
-            todo=_UNDISTORT,
+            todo=advise_undistorting(*(str(PurePosixPath(file).parent) for file in model.files[:1])),
         )
     if lens.model in _ONE_FOCAL:
         fx, cx, cy, *rest = lens.params

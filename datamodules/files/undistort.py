@@ -23,9 +23,13 @@ COEFFICIENTS = {
     "RADIAL": 2,  # k1 k2
     "OPENCV": 4,  # k1 k2 p1 p2
     "FULL_OPENCV": 8,  # k1 k2 p1 p2 k3 k4 k5 k6
+    "SIMPLE_RADIAL_FISHEYE": 1,  # k1 of the angle
+    "RADIAL_FISHEYE": 2,  # k1 k2 of the angle
     "OPENCV_FISHEYE": 4,  # k1 k2 k3 k4 of the angle
 }
 """The lens models that can be undistorted, and how many coefficients each has."""
+FISHEYES = {"SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"}
+"""Of these, the ones that bend the angle; each has the first coefficients of the last one, and no others."""
 LEAST_KEPT = 0.5
 """A lens model that finds less of its frame in the photograph than this is taken for damaged."""
 
@@ -42,7 +46,7 @@ class Distortion:
     @property
     def absent(self) -> bool:
         """True where there is nothing to correct."""
-        return self.model in COEFFICIENTS and self.model != "OPENCV_FISHEYE" and not any(self.coefficients)
+        return self.model in COEFFICIENTS and self.model not in FISHEYES and not any(self.coefficients)
 
     def check(self, where: object = None) -> None:
         """Raises SceneError, with the reason, for a model or coefficients that cannot be undistorted."""
@@ -52,8 +56,7 @@ class Distortion:
                 + ", ".join(COEFFICIENTS),
                 where=where,
                 cause="OpenCV has no inverse of this model",
-                todo="undistort: colmap image_undistorter --image_path images --input_path sparse/0 "
-                "--output_path DIR",
+                todo=advise_undistorting(),
             )
         expected = COEFFICIENTS[self.model]
         if len(self.coefficients) != expected or not all(abs(c) < 1e9 for c in self.coefficients):
@@ -63,6 +66,20 @@ class Distortion:
                 cause="a damaged file, or a calibration that failed",
                 todo="export the cameras again",
             )
+
+
+def advise_undistorting(model: str = "sparse/0") -> str:
+    """What to do about a lens that is not undistorted here: photographs and masks must go the same way.
+
+    Args:
+        model: COLMAP's model, relative to the capture's folder.
+    """
+    command = f"colmap image_undistorter --input_path {model}"
+    return (
+        f"undistort the photographs ({command} --image_path images --output_path DIR) and the masks, each named "
+        f"as its photograph, ending included ({command} --image_path masks --output_path DIR_masks); then move "
+        "DIR_masks/images to DIR/masks and use DIR. Ignored pixels go the way of the masks"
+    )
 
 
 class Undistorted(NamedTuple):
@@ -142,7 +159,7 @@ def _find_sources(
 
     K = K.copy()
     K[:2, 2] -= 0.5  # OpenCV's origin is the first pixel's centre, ours the image's corner
-    k = np.zeros(4 if distortion.model == "OPENCV_FISHEYE" else 8)
+    k = np.zeros(4 if distortion.model in FISHEYES else 8)
     k[: len(distortion.coefficients)] = distortion.coefficients
     make = cv2.fisheye.initUndistortRectifyMap if len(k) == 4 else cv2.initUndistortRectifyMap
     columns, rows = make(K, k, np.eye(3), K, (width, height), cv2.CV_32FC1)

@@ -25,7 +25,7 @@ from datamodules.files import images
 from datamodules.files.parsers import damaged, matrix, number, parse_json, size, text
 from datamodules.files.paths import check_name, inside, printable, read_file, read_inside
 from datamodules.files.pinholes import pinholes
-from datamodules.files.undistort import Distortion
+from datamodules.files.undistort import FISHEYES, Distortion
 from datamodules.request import Request
 from datamodules.views import splits
 from datamodules.views.find_files import ImageFiles
@@ -172,7 +172,7 @@ def _lens_numbers(scope: dict[str, Any], what: str, path: Path) -> dict[str, flo
             f"{what} has {f'an f-theta lens ({odd})' if odd else f'skewed pixels (by {skew:g})'}",
             where=path,
             cause="a lens that cannot be undistorted here",
-            todo="undistort the photographs and give a pinhole: fl_x, fl_y, cx, cy",
+            todo="undistort photographs, masks and ignored pixels alike and give a pinhole: fl_x, fl_y, cx, cy",
         )
     return found
 
@@ -192,21 +192,21 @@ def _distortion(scope: dict[str, Any], what: str, path: Path) -> Distortion | No
     }
     if model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return None
-    if model in ("OPENCV_FISHEYE", "FISHEYE"):
+    if model == "FISHEYE" or model in FISHEYES:
         return Distortion("OPENCV_FISHEYE", (k["k1"], k["k2"], k["k3"], k["k4"]))
     if model not in ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE"):
         raise SceneError(
             f"camera_model {what} is {model!r:.60}, which cannot be undistorted here",
             where=path,
             cause="an unusual lens, or a damaged file",
-            todo="undistort the photographs and give camera_model PINHOLE",
+            todo="undistort photographs, masks and ignored pixels alike and give camera_model PINHOLE",
         )
     if k["k4"]:
         raise SceneError(
             f"k4 {what} is {k['k4']:g}: this radial term has no counterpart in OpenCV's model",
             where=path,
             cause="a fisheye lens without camera_model OPENCV_FISHEYE, or a calibration by another program",
-            todo="undistort the photographs and remove the coefficients",
+            todo="undistort photographs, masks and ignored pixels alike and remove the coefficients",
         )
     short = (k["k1"], k["k2"], k["p1"], k["p2"])
     if k["k3"]:

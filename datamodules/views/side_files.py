@@ -173,7 +173,8 @@ def open_side_file(reading: Reading, relative: str, photo: Photograph, what: str
         else f"the {what} was made of another image: one cropped, or not undistorted as this one is",
         todo=f"turn the {what} by a quarter"
         if sideways
-        else f"make the {what} from the image, at any size of the same shape",
+        else f"make the {what} from the image, at any size of the same shape; where the image was undistorted, "
+        "the same way",
     )
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datamodules.files.undistort import COEFFICIENTS, Distortion, undistort
+from datamodules.files.undistort import COEFFICIENTS, FISHEYES, Distortion, undistort
 from visdom_plugin.errors import SceneError
 
 K = np.array([[70.0, 0, 33.3], [0, 66.0, 22.1], [0, 0, 1]])
@@ -16,6 +16,8 @@ LENSES = {
     "RADIAL": (0.2, -0.1),
     "OPENCV": (0.1, -0.03, 0.006, -0.004),
     "FULL_OPENCV": (0.3, 0.1, 0.002, -0.003, 0.02, 0.15, 0.05, 0.01),
+    "SIMPLE_RADIAL_FISHEYE": (0.06,),
+    "RADIAL_FISHEYE": (0.05, -0.03),
     "OPENCV_FISHEYE": (0.05, -0.02, 0.01, 0.003),
 }
 
@@ -24,7 +26,7 @@ def distort(model, k, u, v):
     """COLMAP's models, written out: undistorted pixel to pixel of the photograph, corner origin."""
     x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
     r2 = x * x + y * y
-    if model == "OPENCV_FISHEYE":
+    if model in FISHEYES:
         r = np.sqrt(r2)
         theta = np.arctan(r)
         bent = theta * (1 + sum(c * theta ** (2 * i + 2) for i, c in enumerate(k)))
@@ -86,7 +88,7 @@ def test_a_weak_lens_changes_little_and_none_changes_nothing(model, strength):
     image = np.arange(HEIGHT * WIDTH * 3, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3)
     mask = image[..., 0] > 99
     none = undistort(K, Distortion(model, (0.0,) * COEFFICIENTS[model]), image, mask)
-    if model != "OPENCV_FISHEYE":
+    if model not in FISHEYES:
         assert none.image is image and none.mask is mask and none.ignore is None
     if COEFFICIENTS[model]:
         k = (strength,) + (0.0,) * (COEFFICIENTS[model] - 1)
@@ -114,9 +116,12 @@ def test_a_lens_that_folds_is_cut_where_it_folds():
     assert np.array_equal(out.ignore[off], (r > np.sqrt(1 / 6))[off])
 
 
-@pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE", "RADIAL_FISHEYE", "nonsense"])
+@pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "nonsense"])
 def test_other_models_are_refused_with_the_reason(model):
-    with pytest.raises(SceneError, match=rf"{model}[\s\S]*possible are[\s\S]*OPENCV[\s\S]*image_undistorter"):
+    with pytest.raises(
+        SceneError,
+        match=rf"{model}[\s\S]*possible are[\s\S]*OPENCV[\s\S]*--image_path images[\s\S]*--image_path masks",
+    ):
         undistort(K, Distortion(model, (0.1,)), np.zeros((4, 4), np.uint8), where="cameras.txt")
 
 

@@ -114,7 +114,7 @@ FAULTS = {
     "mask of zeros and ones": (lambda f: _mask(f, lambda m: m // 255), ["mask is empty", "0 and 1", "255"]),
     "distorted": (
         lambda f: _lens(f, "THIN_PRISM_FISHEYE", "50 50 24 18 0.1" + " 0" * 7),
-        ["THIN_PRISM_FISHEYE", "image_undistorter"],
+        ["THIN_PRISM_FISHEYE", *(f"--input_path sparse/0 --image_path {x} " for x in ("images", "masks"))],
     ),
     "a lens that bends too far": (
         lambda f: _lens(f, "SIMPLE_RADIAL", "50 24 18 -90"),
