@@ -28,7 +28,7 @@ COEFFICIENTS = {
     "OPENCV_FISHEYE": 4,  # k1 k2 k3 k4 of the angle
 }
 """The lens models that can be undistorted, and how many coefficients each has."""
-FISHEYES = {"SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"}
+FISHEYES = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 """Of these, the ones that bend the angle; each has the first coefficients of the last one, and no others."""
 LEAST_KEPT = 0.5
 """A lens model that finds less of its frame in the photograph than this is taken for damaged."""

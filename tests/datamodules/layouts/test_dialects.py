@@ -72,6 +72,7 @@ def _set(**values):
     [
         (_set(intrinsic_matrix=[[50, 9, 20], [0, 50, 15], [0, 0, 1]]), ["frame 0", "skewed", "undistort"]),
         (_set(sk_x=9.0), ["frame 0", "skewed"]),
+        (lambda c: c.update(camera_model=["OPENCV"]), ["camera_model", "['OPENCV']", "photographs, masks"]),
         (_set(ftheta_p0=0.1), ["f-theta", "ftheta_p0"]),
         (_set(K=[1, 2, 3]), ["K of frame 0", "3 x 3"]),
         (
@@ -91,6 +92,18 @@ def test_what_cannot_be_read_is_named(change, words, views, tmp_path):
         load(folder, views=4)
     assert all(word in str(error.value) for word in words), str(error.value)
     assert "copy the file again" not in str(error.value) or "wrongly written" in str(error.value)
+
+
+@pytest.mark.parametrize("lens", ["SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"])
+def test_short_fisheyes_are_opencvs_with_zeros(lens, views, tmp_path):
+    def give(model, **bend):
+        _edit(folder, lambda content: content.update(camera_model=model, **bend))
+        return load(folder, views=4).train.images
+
+    folder = w.write_nerfstudio(views, tmp_path / "s")
+    bent = give(lens, k1=0.1, k2=0.0 if lens.startswith("SIMPLE") else -0.05)
+    assert all(map(torch.equal, bent, give("OPENCV_FISHEYE")))
+    assert not all(map(torch.equal, bent, give("OPENCV", k1=0.0, k2=0.0)))
 
 
 def test_transform_without_s_is_blenders_file(views, tmp_path):
