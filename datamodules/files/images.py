@@ -22,6 +22,7 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".avif", "
 """Of the files of these formats, in lower case; PNG first, as masks are looked for in this order."""
 _MARKS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
 """How files end of the formats that OpenCV decodes; it fills what is missing with grey and says nothing."""
+_LOSSLESS = ("PNG", "TIFF", "BMP")
 _PLUGINS = {
     "PNG": ("PIL.PngImagePlugin", "PngImageFile"),
     "JPEG": ("PIL.JpegImagePlugin", "JpegImageFile"),
@@ -139,6 +140,27 @@ def decode_any(data: bytes, path: Path) -> np.ndarray:
     if pixels.ndim == 3 and pixels.shape[2] >= 3:
         pixels = pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
     return np.ascontiguousarray(pixels)
+
+
+def decode_palette(data: bytes, path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """(H, W) uint8 indices of an opaque palette image and its (256, 3) uint8 RGB palette; None of other images."""
+    kind = _kind(data, path)
+    if kind not in _LOSSLESS:
+        return None
+    try:
+        image: Image.Image = _open(data, kind, path)[0]
+        if image.mode != "P" or "transparency" in image.info:
+            return None
+        indices, palette = np.asarray(image), np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
+        missing = np.zeros((256 - len(palette), 3), np.uint8)
+    except Exception as error:  # Pillow raises whatever it comes across
+        _damaged(path, f"the {kind} cannot be decoded: {str(error)[:120]}")
+    return indices, np.concatenate([palette, missing])
+
+
+def is_lossless(data: bytes, path: Path) -> bool:
+    """Whether the file's format keeps every value as it was saved, so that small numbers are no noise."""
+    return _kind(data, path) in _LOSSLESS
 
 
 def decode_depth(data: bytes, path: Path) -> np.ndarray:

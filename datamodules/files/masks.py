@@ -17,7 +17,10 @@ from visdom_plugin.errors import SceneError
 
 MOST_ENLARGED = 10
 """A mask more than this many times wider than its image is refused before it is decoded."""
+MOST_LABELS, LARGEST_LABEL = 32, 63
+"""An image of more, or larger, grey values is no label image but a soft mask."""
 _NEARLY_FULL = 0.93
+_COLOURFUL = 16  # of 255, between a colour's channels: less comes of reducing a grey picture to a palette
 _SOFT = (0.02, 0.98)
 _AGREED = 0.01
 
@@ -29,6 +32,8 @@ class Mask(NamedTuple):
     """(H, W) float32 in [0, 1]; above one half is object."""
     soft: float
     """Share of the pixels that are neither black nor white."""
+    labelled: bool = False
+    """Whether the file's values are numbers of objects: 0 is background, all others are object."""
 
 
 def fits(size: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -47,10 +52,11 @@ def fits(size: tuple[int, int], other: tuple[int, int]) -> bool:
 def decode_mask(data: bytes, path: Path) -> Mask:
     """A foreground mask from L, LA, RGB, RGBA, palette, 1-bit, 8-bit or 16-bit PNG or JPEG.
 
-    Its alpha channel is the mask where it varies, else its brightest colour channel is.
+    Its alpha channel is the mask where it varies; else a label image is object where its value is not 0; else
+    its brightest colour channel is the mask.
 
     Raises:
-        SceneError: both could be, and they disagree.
+        SceneError: two readings are possible, and they disagree.
     """
     pixels = images.decode_any(data, path)
     alpha = alpha_of(pixels)
@@ -58,7 +64,8 @@ def decode_mask(data: bytes, path: Path) -> Mask:
     full = np.float32(np.iinfo(pixels.dtype).max)
     colour = colour.astype(np.float32) / full
     if alpha is None:
-        return _measured(colour)
+        labels = _find_labels(data, path, pixels)
+        return _measured(colour) if labels is None else Mask((labels > 0).astype(np.float32), 0.0, True)
     alpha = alpha.astype(np.float32) / full
     # A cut-out's colours are a photograph; only colours that are black and white could be meant as a mask.
     if colour.min() != colour.max() and soft_share(colour) < _AGREED and _differ(colour, alpha):
@@ -69,6 +76,32 @@ def decode_mask(data: bytes, path: Path) -> Mask:
             todo="save it as a grey image without alpha channel",
         )
     return _measured(alpha)
+
+
+def _find_labels(data: bytes, path: Path, pixels: np.ndarray) -> np.ndarray | None:
+    """(H, W) numbers of objects where the file is a label image, else None.
+
+    That is a palette in colours, or a few small grey values with 0 among them, in a format without loss.
+    """
+    if (paletted := images.decode_palette(data, path)) is not None:
+        indices, palette = paletted
+        used = np.unique(indices)
+        if len(used) > 1 and np.ptp(palette[used].astype(int), axis=1).max() > _COLOURFUL:
+            black = used[~palette[used].any(1)]
+            if len(black) and black[0] != 0:
+                raise SceneError(
+                    f"the mask's palette has black, the usual background, at {black[0]} and another colour at 0",
+                    where=path,
+                    cause="a picture reduced to a palette, whose order says nothing",
+                    todo="save the mask as a grey image with 0 and 255",
+                )
+            return indices
+    if pixels.ndim == 3 and (pixels.shape[2] < 3 or (pixels[..., :1] != pixels[..., :3]).any()):
+        return None
+    grey = pixels if pixels.ndim == 2 else pixels[..., 0]
+    if grey.max() > LARGEST_LABEL or grey.max() == 0 or grey.min() > 0 or not images.is_lossless(data, path):
+        return None
+    return grey if len(np.unique(grey)) <= MOST_LABELS else None
 
 
 def decode_alpha(pixels: np.ndarray) -> Mask | None:

@@ -25,7 +25,7 @@ from visdom_plugin.errors import SceneError
 _T = TypeVar("_T")
 _LOOKED_AT = 6
 """Views whose pixels decide whether masks are turned."""
-_VERSION = 1
+_VERSION = 2
 """Raised when other pixels are made of the same files."""
 
 

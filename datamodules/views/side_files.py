@@ -206,4 +206,6 @@ def _read_turned(
     elif turns:
         remarks.append(f"masks turned by their EXIF orientation {turns[0]}")
     found = masks.decode_mask(other.data, other.path)
+    if found.labelled:
+        remarks.append("label images read as masks: 0 is background, every other value is object")
     return found._replace(opacity=orientation.apply(found.opacity, turns)), other.path, tuple(remarks)

@@ -126,3 +126,66 @@ def test_an_empty_mask_says_why(value, said):
     with pytest.raises(SceneError, match=said):
         masks.refuse_empty(np.zeros((3, 3), bool), value, "mask.png")
     masks.refuse_empty(np.ones((3, 3), bool), value, "mask.png")
+
+
+LABELS = np.where(TRUTH, 1 + np.arange(17) % 3, 0).astype(np.uint8)
+COLOURS = [[0, 0, 0], [128, 0, 0], [0, 64, 0], [0, 0, 90]]
+
+
+def _coloured(indices, colours, kind="PNG"):
+    out = io.BytesIO()
+    image = PIL.fromarray(indices.astype(np.uint8)).convert("P")
+    image.putpalette(np.array(colours, np.uint8).tobytes())
+    image.save(out, kind)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: _cv(TRUTH.astype(np.uint8)),
+        lambda: _cv(LABELS),
+        lambda: _cv(LABELS * 21),
+        lambda: _cv(np.dstack([LABELS] * 3)),
+        lambda: _cv(LABELS.astype(np.uint16)),
+        lambda: cv2.imencode(".tif", LABELS)[1].tobytes(),
+        lambda: _coloured(LABELS, COLOURS),
+        lambda: _coloured(LABELS, COLOURS, "BMP"),
+        lambda: _coloured(LABELS, COLOURS, "TIFF"),
+        lambda: _coloured(LABELS, [[70, 0, 0], *COLOURS[1:]]),
+        lambda: _coloured(LABELS, [[i] * 3 for i in range(4)]),
+    ],
+    ids=[
+        "0 1", "labels", "to 63", "RGB", "16 bit", "TIFF", "palette", "BMP palette", "TIFF palette",
+        "no black", "grey palette",
+    ],
+)  # fmt: skip
+def test_label_images_are_object_where_they_are_not_0(make):
+    mask = masks.decode_mask(make(), "mask.png")
+    assert mask.labelled and mask.soft == 0
+    assert np.array_equal(mask.opacity, TRUTH.astype(np.float32))
+
+
+def test_what_is_no_label_image_is_read_by_its_brightness():
+    soft = cv2.GaussianBlur(GREY, (0, 0), 1)
+    dark = np.linspace(0, 60, 12 * 17).reshape(12, 17).astype(np.uint8)
+    for image in (
+        soft,
+        soft[:, :4],
+        dark,
+        np.where(TRUTH, 255, np.arange(17) % 3 * 9),
+        np.where(TRUTH, 64, 0),
+    ):
+        image = np.ascontiguousarray(image, np.uint8)
+        mask = masks.decode_mask(_cv(image), "mask.png")
+        assert not mask.labelled and np.array_equal(mask.opacity, image.astype(np.float32) / np.float32(255))
+    noise = cv2.imencode(".jpg", LABELS * 9)[1].tobytes()
+    assert not masks.decode_mask(noise, "mask.jpg").labelled
+    assert not masks.decode_mask(_palette(), "mask.png").labelled, "black and white"
+    white_first = masks.decode_mask(_coloured(~TRUTH, [[255, 255, 255], [0, 0, 0]]), "mask.png")
+    assert not white_first.labelled and np.array_equal(white_first.opacity > 0.5, TRUTH)
+
+
+def test_a_palette_whose_order_contradicts_its_colours_is_refused():
+    with pytest.raises(SceneError, match=r"black, the usual background, at 1[\s\S]*0 and 255"):
+        masks.decode_mask(_coloured(~TRUTH, [[255, 0, 0], [0, 0, 0]]), "mask.png")

@@ -65,6 +65,16 @@ def test_soft_masks_are_cut_at_one_half_and_said(tiny, folder):
     assert any("50.0% of their pixels are neither black nor white, cut at one half" in n for n in scene.notes)
 
 
+def test_label_images_are_read_and_said(tiny, folder):
+    for i, name in enumerate(tiny.train.names[:3]):
+        labels = tiny.train.masks[i].numpy() * np.uint8([1, 2, 40][i])
+        write(folder / f"masks/{name}.png", labels)
+    scene = load(folder)
+    assert all(map(torch.equal, scene.train.masks, tiny.train.masks))
+    said = "3 of 4 training views: label images read as masks: 0 is background, every other value is object"
+    assert said in scene.notes
+
+
 def test_the_alpha_channel_is_the_mask_where_there_is_no_other(tiny, folder):
     add_alpha(folder, truth(tiny))
     empty(folder / "masks")

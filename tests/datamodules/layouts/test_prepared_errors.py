@@ -111,7 +111,7 @@ FAULTS = {
     ),
     "empty mask": (lambda f: _mask(f, lambda m: m * 0), ["mask is empty", "train_002"]),
     "empty test mask": (lambda f: _mask(f, lambda m: m * 0, "test_002"), ["mask is empty", "test_002"]),
-    "mask of zeros and ones": (lambda f: _mask(f, lambda m: m // 255), ["mask is empty", "0 and 1", "255"]),
+    "mask of 8 bits in 16": (lambda f: _mask(f, lambda m: m.astype(np.uint16)), ["mask is empty", "16-bit"]),
     "distorted": (
         lambda f: _lens(f, "THIN_PRISM_FISHEYE", "50 50 24 18 0.1" + " 0" * 7),
         ["THIN_PRISM_FISHEYE", *(f"--input_path sparse/0 --image_path {x} " for x in ("images", "masks"))],
