@@ -139,6 +139,8 @@ def main() -> None:
         r = rows[-1]
         times = f"{r['votes_s']:8.3f} {r['carve_s']:8.3f}"
         print(f"{resolution:10d} {times} {r['peak_growth_mib']:34.0f} {r['voxels']:10d}")
+    if len(rows) < 2:
+        return
     sides = np.log([r["resolution"] for r in rows])
     for name in ("votes_s", "carve_s"):
         slope = np.polyfit(sides, np.log([r[name] for r in rows]), 1)[0]
