@@ -1,19 +1,9 @@
 from __future__ import annotations
 
-import logging
-
 import pytest
 
 from tests.training import fake
 from visdom_plugin import registry
-
-
-@pytest.fixture(autouse=True)
-def heard():
-    """A command with --quiet silences its process; the tests after it want to hear."""
-    yield
-    for name in ("visdom_plugin", "datamodules", "method_configs"):
-        logging.getLogger(name).setLevel(logging.NOTSET)
 
 
 @pytest.fixture

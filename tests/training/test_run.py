@@ -72,7 +72,7 @@ class SpyHull:
 
     seen: tuple = ()
 
-    def carve(self, cameras, masks):
+    def carve(self, cameras, masks, ignore=()):
         return SpyHullGrid(cameras, list(masks))
 
 
@@ -233,7 +233,7 @@ def test_the_scene_object_is_not_changed(train, scene):
 
 
 def test_a_mistake_found_before_the_first_step_leaves_no_trace(train, tmp_path, monkeypatch):
-    def empty(self, cameras, masks):
+    def empty(self, cameras, masks, ignore=()):
         raise EmptyHullError("no voxel")
 
     with monkeypatch.context() as patch, pytest.raises(EmptyHullError):

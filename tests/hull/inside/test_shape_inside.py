@@ -22,8 +22,8 @@ from visdom_plugin.hull.inside.shape import shape_inside
 BALLS = [((0.0, 0.0, 0.0), 0.8), ((0.7, 0.3, 0.5), 0.4), ((-0.2, 0.9, -0.6), 0.25)]
 
 
-def carve(cameras, masks, resolution=64, **fields) -> Hull:
-    return VisibleDomain(resolution=resolution, **fields).carve(cameras, masks)
+def carve(cameras, masks, ignore=(), *, resolution=64, **fields) -> Hull:
+    return VisibleDomain(resolution=resolution, **fields).carve(cameras, masks, ignore)
 
 
 @pytest.fixture(scope="module")

@@ -20,10 +20,10 @@ def carved(monkeypatch):
     """The domains carved, in order."""
     domains, carve = [], VisibleDomain.carve
 
-    def noted(domain, cameras, masks):
+    def noted(domain, cameras, masks, ignore=()):
         domains.append(domain)
         # The default one at a size that costs nothing.
-        return carve(VisibleDomain(dilate_px=domain.dilate_px, resolution=24), cameras, masks)
+        return carve(VisibleDomain(dilate_px=domain.dilate_px, resolution=24), cameras, masks, ignore)
 
     monkeypatch.setattr(VisibleDomain, "carve", noted)
     return domains
@@ -73,7 +73,7 @@ def test_a_damaged_hull_is_carved_again_and_said(train, carved, scene, tmp_path,
 
 
 def test_without_a_reference_its_metric_is_left_out(train, monkeypatch, tmp_path):
-    def empty(domain, cameras, masks):
+    def empty(domain, cameras, masks, ignore=()):
         raise EmptyHullError("nothing is left")
 
     monkeypatch.setattr(VisibleDomain, "carve", empty)
