@@ -98,6 +98,12 @@ def load(
     request = Request(views=views, downscale=downscale, test=test, **reading)
     _check_format(data_format)
     if path is None:
+        if request.split is not None:
+            raise ConfigError(
+                "the built-in scene has no published split",
+                where="--split",
+                todo="name a scene, or leave it out",
+            )
         from datamodules.synthetic.config import SyntheticConfig
         from datamodules.synthetic.scene import make_scene
 

@@ -89,7 +89,9 @@ def choose_named(root: Path, names: Sequence[str], request: Request) -> Split:
 def _find_scene(rows: Sequence[Row], scene: str, root: Path, request: Request) -> str:
     known = list(dict.fromkeys(row.scene for row in rows))
     candidates = [scene] if scene else list(reversed(root.resolve().parts))[:3]
-    found = [c for c in candidates if c in known]
+    # Two Omni3D objects carry their size in the release's names, which other copies of the data leave out.
+    spelled = {name.removesuffix("_1080"): name for name in known} | {name: name for name in known}
+    found = [spelled[c] for c in candidates if c in spelled]
     if not found:
         raise ConfigError(
             f"the split has no scene {candidates[0]!r}",

@@ -152,3 +152,12 @@ def test_description_of_a_file(tmp_path):
     assert about["bounds"][1] == gaussians.means.double().amax(0).tolist()
     assert math.isclose(about["scale_largest"], float(gaussians.log_scales.exp().max()), rel_tol=1e-5)
     assert "SplatRenderMode: default" in about["comments"]
+
+
+def test_spz_refuses_positions_that_its_24_bits_cannot_hold(tmp_path):
+    gaussians = make_gaussians(40)
+    for shift in (0.0, 1e3):
+        write_spz(tmp_path / "near.spz", gaussians, torch.tensor([shift, 0, 0], dtype=torch.float64))
+    with pytest.raises(ConfigError, match="24 bits"):
+        write_spz(tmp_path / "far.spz", gaussians, torch.tensor([5e6, 0, 0], dtype=torch.float64))
+    assert not (tmp_path / "far.spz").exists()

@@ -85,3 +85,17 @@ def test_an_actor_is_read_at_the_splits_frame_by_the_names_of_its_cameras(tiny, 
 
 def test_every_split_that_is_listed_is_read():
     assert list_names() == ["visdom"] and all(Path(r.scene).name == r.scene for r in load_rows("visdom"))
+
+
+@pytest.mark.parametrize("scene", ["gloves_009", "timer_010"])
+def test_objects_whose_size_stands_in_the_releases_name_are_found_without_it(scene, tmp_path):
+    one, other = (
+        choose_named(tmp_path / folder, _names(200), Request(views=4, split="visdom"))
+        for folder in (scene, f"{scene}_1080")
+    )
+    assert one == other
+
+
+def test_the_built_in_scene_has_no_published_split():
+    with pytest.raises(ConfigError, match="built-in scene has no published split"):
+        datamodules.load(None, views=4, split="visdom")
