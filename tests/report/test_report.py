@@ -11,7 +11,7 @@ import pytest
 from tests import browser
 from visdom_plugin.cli.commands import report, train
 from visdom_plugin.cli.reports import repeat_command
-from visdom_plugin.report.gather import colour_depth
+from visdom_plugin.figures.contact_sheet import colour_depth
 
 
 def finish(*options: str) -> Path:

@@ -1,4 +1,4 @@
-"""Renders as files: PNGs, the contact sheet, videos."""
+"""Renders as files: PNGs, the contact sheet, error and depth in colours."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from visdom_plugin.atomic_files import appearing, write_bytes
+from visdom_plugin.atomic_files import write_bytes
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -118,6 +118,28 @@ def draw_error(truth: np.ndarray, render: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[..., ::-1])
 
 
+def depth_span(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float] | None:
+    """Range of depths of what is half opaque, without a hundredth at either end; None where nothing is."""
+    there = depth[alpha > 0.5]
+    return (float(np.percentile(there, 1)), float(np.percentile(there, 99))) if len(there) else None
+
+
+def colour_depth(depth: np.ndarray, alpha: np.ndarray, span: tuple[float, float] | None = None) -> np.ndarray:
+    """(H, W, 3) uint8: near is bright, far is dark; white beside what is half opaque.
+
+    Args:
+        depth, alpha: (H, W).
+        span: depths of the brightest and the darkest colour; by default this picture's own.
+    """
+    import cv2
+
+    near, far = span or depth_span(depth, alpha) or (0.0, 1.0)
+    share = ((far - depth) / max(far - near, 1e-9)).clip(0, 1)
+    grey = (share * 255).round().astype(np.uint8)
+    colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    return np.where((alpha > 0.5)[..., None], colours, 255).astype(np.uint8)
+
+
 def read_png(path: Path) -> np.ndarray:
     """What `write_png` wrote of a colour picture, (H, W, 3) uint8 RGB."""
     import cv2
@@ -126,40 +148,3 @@ def read_png(path: Path) -> np.ndarray:
     if picture is None:
         raise OSError(f"{path} is no picture")
     return np.ascontiguousarray(picture[..., ::-1])
-
-
-def write_video(path: Path, frames: list[np.ndarray], fps: int = 30) -> str:
-    """Writes frames (H, W, 3) uint8 of equal size as mp4: H.264 where PyAV is there, else MPEG-4 by OpenCV.
-
-    H.264 wants even sizes: an odd last row or column is repeated. Returns the codec's name.
-    """
-    h, w = frames[0].shape[:2]
-    frames = [np.pad(f, ((0, h % 2), (0, w % 2), (0, 0)), mode="edge") for f in frames]
-    try:
-        import av
-    except ImportError:
-        av = None
-    with appearing(path) as part:
-        if av is None:
-            _write_mpeg4(part, frames, fps)
-        else:
-            with av.open(str(part), "w") as container:
-                stream = container.add_stream("libx264", rate=fps, options={"crf": "18"})
-                stream.height, stream.width = frames[0].shape[:2]
-                stream.pix_fmt = "yuv420p"
-                for frame in frames:
-                    container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-                container.mux(stream.encode())
-    return "mp4v" if av is None else "h264"
-
-
-def _write_mpeg4(path: Path, frames: list[np.ndarray], fps: int) -> None:
-    import cv2
-
-    h, w = frames[0].shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (w, h))
-    if not writer.isOpened():
-        raise OSError(f"OpenCV could not open {path} for video")
-    for frame in frames:
-        writer.write(np.ascontiguousarray(frame[..., ::-1]))
-    writer.release()

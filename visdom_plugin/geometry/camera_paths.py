@@ -101,3 +101,47 @@ def orbit(cameras: Cameras, count: int, look_at: Tensor | None = None) -> Camera
     return Cameras(
         one.intrinsics.expand(count, 3, 3), motion, one.width.expand(count), one.height.expand(count)
     )
+
+
+def resample(cameras: Cameras, count: int, look_at: Tensor) -> Cameras:
+    """Cameras (count,) along the way from the first of (N,) cameras to the last, the same share between any two.
+
+    Args:
+        look_at: (3,) point that the way swings round, see `interpolate`.
+    """
+    legs = max(len(cameras) - 1, 1)
+    along = [i * legs / max(count - 1, 1) for i in range(count)]
+    starts = [min(int(t), legs - 1) for t in along]
+    size = (cameras.width[0], cameras.height[0])
+    return Cameras.stack(
+        [
+            interpolate(cameras[s], cameras[min(s + 1, len(cameras) - 1)], t - s, look_at).resized(*size)
+            for s, t in zip(starts, along, strict=True)
+        ]
+    )
+
+
+def framed(cameras: Cameras, width: int | None, height: int | None) -> Cameras:
+    """Cameras whose pictures have another size, and show as much from top to bottom as before.
+
+    Args:
+        width, height: pixels; of one alone the other follows, with both, more or less is seen at the sides.
+    """
+    if width is None and height is None:
+        return cameras
+    if width is None or height is None:
+        known, other = (cameras.width, cameras.height) if height is None else (cameras.height, cameras.width)
+        side = width if height is None else height
+        follows = (other * (side or 1) / known).round().clamp_min(1).long()
+        given = torch.full_like(follows, side or 1)
+        return cameras.resized(*((given, follows) if height is None else (follows, given)))
+    ratio = (height / cameras.height.double()).to(cameras.intrinsics)
+    K = cameras.intrinsics.clone()
+    K[..., :2, :] *= ratio[..., None, None]
+    K[..., 0, 2] += (width - cameras.width * ratio) / 2
+    return Cameras(
+        K,
+        cameras.world_from_camera,
+        torch.full_like(cameras.width, width),
+        torch.full_like(cameras.height, height),
+    )

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from visdom_plugin.atomic_files import write_bytes, write_json
-from visdom_plugin.figures.contact_sheet import draw_error, shown_on_sheet, to_bytes
+from visdom_plugin.figures.contact_sheet import colour_depth, draw_error, shown_on_sheet, to_bytes
 from visdom_plugin.geometry.camera_paths import orbit
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.training.evaluate import draw_truth, hull_silhouette
@@ -110,18 +110,6 @@ def _keep_view(folder: Path, n: int, views: Views, i: int, render: Render) -> di
     }
     files = {what: _write(folder, f"view_{n}_{what}", picture) for what, picture in pictures.items()}
     return {"name": str(views.names[i]), "width": size[0], "height": size[1], "files": files}
-
-
-def colour_depth(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: near is bright, far is dark, over the range of what is half opaque; white beside it."""
-    import cv2
-
-    there = alpha > 0.5
-    near, far = np.percentile(depth[there], (1, 99)) if there.any() else (0.0, 1.0)
-    share = ((far - depth) / max(far - near, 1e-9)).clip(0, 1)
-    grey = (share * 255).round().astype(np.uint8)
-    colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)[..., ::-1]
-    return np.where(there[..., None], colours, 255).astype(np.uint8)
 
 
 def _keep_orbit(folder: Path, run: Finished, rate: float) -> dict[str, Any]:

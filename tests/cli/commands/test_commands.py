@@ -178,8 +178,12 @@ def test_what_cannot_be_rendered_is_said_before_anything_is(trained, capsys, mon
         err = capsys.readouterr().err
         assert says in err and "what to do" in err and "Traceback" not in err
 
-    for name in ("video", "video.gif", "folder/", "."):
-        fails(["--out", name], "ends in .mp4")
+    for name in ("video", "video.webm", "folder/", "."):
+        fails(["--out", name], "says no format")
+        fails(["--out", name, "--format", "mp4"], "ends in .mp4")
+    fails(["--out", "one.png"], "do not fit into one file")
+    fails(["--out", "video.gif", "--fps", "60"], "at most 50 frames")
+    fails(["--path", "orbot"], "did you mean 'orbit'")
     record = json.loads((trained / "run.json").read_text())
     for changed, says in ((empty, "there are no test views"), (mixed, "differ in size")):
         monkeypatch.setattr(datamodules, "load", lambda *a, scene=changed, **k: scene)
@@ -191,7 +195,7 @@ def test_what_cannot_be_rendered_is_said_before_anything_is(trained, capsys, mon
 
 def test_the_path_between_views_begins_and_ends_at_views():
     scene = fake.tiny_scene()
-    cameras = render.cameras_along("between", 7, scene, None)
+    cameras, _ = render.cameras_along("between", 7, scene, None)
     ends = scene.train.cameras.world_from_camera[[0, -1]]
     assert (cameras.world_from_camera[[0, -1]] - ends).abs().max() < 1e-9 and len(cameras) == 7
 

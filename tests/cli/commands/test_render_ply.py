@@ -30,7 +30,7 @@ def test_pictures_are_those_of_the_rasteriser(cloud, path, count, capsys):
     pictures = sorted(folder.iterdir())
     assert [p.name for p in pictures] == [f"{i:04d}.png" for i in range(count)]
     scene = load(None, views=3, downscale=4, seed=0)
-    cameras = render.cameras_along(path, 2, scene, None)
+    cameras, _ = render.cameras_along(path, 2, scene, None)
     for i, picture in enumerate(pictures):
         drawn = rasterise(read_ply(cloud), cameras[i], torch.ones(3), near=0.01).rgb
         assert np.array_equal(read_png(picture), to_bytes(drawn))
