@@ -10,7 +10,7 @@ from importlib.metadata import version
 
 from visdom_plugin.cli.early import read_early
 from visdom_plugin.errors import ConfigError, VisDomError
-from visdom_plugin.hull.checks.wording import for_commands
+from visdom_plugin.hull.wording import for_commands
 
 USER_ERROR, INTERRUPTED = 2, 130
 BUG = "this is a bug in visdom-plugin or in a plugin; please report it with:"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from visdom_plugin.hull.settings import HullSettings
+from visdom_plugin.hull.wording import wording
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -72,7 +73,6 @@ class VisibleDomain(HullSettings):
         from visdom_plugin.hull.checks.coverage import looks_sound
         from visdom_plugin.hull.checks.degenerate import stand_at_one_point
         from visdom_plugin.hull.checks.mask_checks import look_inverted
-        from visdom_plugin.hull.checks.wording import wording
 
         log.info("carving the hull (its kernels are compiled once per machine, which takes 10 to 30 s)")
         silhouettes = gather_silhouettes(cameras, masks, ignore, dilate_px=self.dilate_px)

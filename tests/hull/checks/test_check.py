@@ -27,8 +27,8 @@ from visdom_plugin.hull.checks.silhouette_consistency import (
     march_rays,
     measure_coherence,
 )
-from visdom_plugin.hull.checks.wording import for_commands
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.wording import for_commands
 
 BOX = ((-0.4, -0.5, -0.3), (0.5, 0.3, 0.4))
 ROOT = os.environ.get("VISDOM_SCENES")

@@ -18,9 +18,9 @@ from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks import explain_failure
 from visdom_plugin.hull.checks.coverage import estimate_coverage, measure_coverage
-from visdom_plugin.hull.checks.wording import for_commands
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
+from visdom_plugin.hull.wording import for_commands
 
 GL = torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
 SMALL = VisibleDomain(resolution=48)

@@ -33,8 +33,8 @@ from visdom_plugin.hull.checks.mask_checks import (
 )
 from visdom_plugin.hull.checks.pose_conventions import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.checks.silhouette_consistency import Coherence, measure_coherence
-from visdom_plugin.hull.checks.wording import wording
 from visdom_plugin.hull.foreign import to_numpy
+from visdom_plugin.hull.wording import wording
 
 CLUSTERED_DEGREES = 60.0
 """Views within this angle leave a hull more than 1.7 times as deep as the object."""
