@@ -109,8 +109,7 @@ def test_formats_are_read_back_by_trimesh(tmp_path, suffix, shift):
     path = tmp_path / f"a.{suffix}"
     meshes.write_mesh(path, mesh)
     back = trimesh.load(path, process=False, force="mesh", maintain_order=True)
-    allowed = 0.01 if suffix == "obj" and shift else 1e-5 * (1 + shift * (suffix == "obj"))
-    assert np.allclose(np.asarray(back.vertices), mesh.vertices, atol=allowed)
+    assert np.allclose(np.asarray(back.vertices), mesh.vertices, rtol=0, atol=1e-6)
     assert np.array_equal(np.asarray(back.faces), mesh.faces)
     if suffix != "glb":  # of which trimesh drops the colours beside a material
         assert np.array_equal(np.asarray(back.visual.vertex_colors)[:, :3], mesh.rgb)

@@ -154,10 +154,24 @@ def test_description_of_a_file(tmp_path):
     assert "SplatRenderMode: default" in about["comments"]
 
 
-def test_spz_refuses_positions_that_its_24_bits_cannot_hold(tmp_path):
+@pytest.mark.parametrize("kind", ["spz", "splat", "sog", "html"])
+def test_map_coordinates_are_refused_where_a_format_would_round_them(tmp_path, kind):
     gaussians = make_gaussians(40)
-    for shift in (0.0, 1e3):
-        write_spz(tmp_path / "near.spz", gaussians, torch.tensor([shift, 0, 0], dtype=torch.float64))
-    with pytest.raises(ConfigError, match="24 bits"):
-        write_spz(tmp_path / "far.spz", gaussians, torch.tensor([5e6, 0, 0], dtype=torch.float64))
-    assert not (tmp_path / "far.spz").exists()
+    with pytest.raises(ConfigError, match=r"(?s)5e\+06|5000.*map coordinates.*--upright"):
+        shift = torch.tensor([5e6, 0, 0], dtype=torch.float64)
+        splat_files.write_splats(tmp_path / f"far.{kind}", gaussians, shift)
+    assert not list(tmp_path.iterdir())
+
+
+def test_map_coordinates_stay_from_file_to_file(tmp_path):
+    gaussians = make_gaussians(40, dtype=torch.float32).detach()
+    shift = torch.tensor([5e6, -4e6, 100.0], dtype=torch.float64)
+    write_gaussians(tmp_path / "far.ply", gaussians, shift)
+    near, origin = splat_files.read_near(tmp_path / "far.ply")
+    assert torch.allclose(near.means + origin, gaussians.means + shift, rtol=0, atol=1e-6)
+    about = splat_files.describe(tmp_path / "far.ply")
+    assert np.allclose(about["bounds"][0], (gaussians.means.double() + shift).amin(0), rtol=0, atol=1e-6)
+    # Near the origin nothing is moved.
+    write_gaussians(tmp_path / "near.ply", gaussians)
+    near, origin = splat_files.read_near(tmp_path / "near.ply")
+    assert not origin.any() and torch.equal(near.means, gaussians.means)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -82,9 +83,14 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
 
 
 def mesh_obj(mesh: Mesh) -> bytes:
-    """Wavefront OBJ; colours stand behind the coordinates, as Blender and MeshLab read them."""
+    """Wavefront OBJ; colours stand behind the coordinates, as Blender and MeshLab read them.
+
+    Coordinates have as many digits as tell a ten millionth of the mesh's size, however far the origin is.
+    """
     parts = [mesh.vertices] if mesh.rgb is None else [mesh.vertices, mesh.rgb / 255]
-    words = "v %.9g %.9g %.9g" + " %.4f %.4f %.4f" * (len(parts) - 1)
+    size = float(np.ptp(mesh.vertices, axis=0).max(initial=0)) if len(mesh.vertices) else 0.0
+    digits = max(0, 7 - math.floor(math.log10(size))) if size > 0 else 7
+    words = f"v %.{digits}f %.{digits}f %.{digits}f" + " %.4f %.4f %.4f" * (len(parts) - 1)
     lines = [words % tuple(row) for row in np.concatenate(parts, 1).tolist()]
     lines += ["f %d %d %d" % tuple(row) for row in (mesh.faces + 1).tolist()]  # noqa: UP031
     return ("\n".join(lines) + "\n").encode()

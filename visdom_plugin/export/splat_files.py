@@ -16,8 +16,9 @@ from visdom_plugin.atomic_files import appearing, write_bytes
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.export.spz import read_spz, write_spz
 from visdom_plugin.geometry.harmonics import C0
+from visdom_plugin.geometry.local_frame import is_near
 from visdom_plugin.splat.gaussians import Gaussians
-from visdom_plugin.splat.ply import read_ply, write_gaussians
+from visdom_plugin.splat.ply import read_ply, read_ply_near, write_gaussians
 from visdom_plugin.splat.spherical_harmonics import sh_from_rgb
 
 WRITTEN = ("ply", "spz", "splat", "sog", "html")
@@ -34,22 +35,42 @@ def write_splats(path: Path, gaussians: Gaussians, origin: Tensor | None = None)
         origin: (3,) float64 of their frame in the frame the file shall have; None for the same frame.
 
     Raises:
-        ConfigError: the format needs splat-transform, which is not there or fails.
+        ConfigError: the format needs splat-transform, which is not there or fails; or it cannot hold such a frame,
+            see `refuse_far`.
     """
     kind = path.suffix.lower().removeprefix(".")
     if kind == "ply":
         write_gaussians(path, gaussians, origin)
-    elif kind == "spz":
+        return
+    refuse_far(path, gaussians, origin)
+    if kind == "spz":
         write_spz(path, gaussians, origin)
     elif kind == "splat":
         write_bytes(path, _splat_bytes(gaussians, origin))
     else:
         with tempfile.TemporaryDirectory() as folder, appearing(path) as part:
             plain = Path(folder) / f"{path.stem}.ply"
-            # Single precision, which is all that the program reads: it is for who views, not for surveys.
-            moved = gaussians if origin is None else _shift(gaussians, origin)
-            write_gaussians(plain, moved)
+            write_gaussians(plain, gaussians if origin is None else _shift(gaussians, origin))
             splat_transform(plain, part, asked=path)
+
+
+def refuse_far(path: Path, gaussians: Gaussians, origin: Tensor | None) -> None:
+    """Refuses Gaussians that are too far from their frame's origin for numbers of 32 bits.
+
+    Raises:
+        ConfigError: they are, see `local_frame.is_near`.
+    """
+    means = gaussians.means.detach().cpu().double() + (0 if origin is None else origin)
+    spread = float(np.ptp(means.numpy(), axis=0).max(initial=0)) if len(means) else 0.0
+    if len(means) > 1 and not is_near(means, spread):
+        raise ConfigError(
+            f"positions reach {float(means.abs().max()):.7g} from the origin over a scene of {spread:.3g}, "
+            f"and {path.suffix} holds them in 32 bits or less, which moves them",
+            where=path,
+            cause="a capture in map coordinates, far from the origin",
+            todo="move it to the middle with --upright (of a file, with --data DIR, its scene), or write a .ply, "
+            "which holds them in 64 bits",
+        )
 
 
 def read_splats(path: Path, origin: Tensor | None = None) -> Gaussians:
@@ -80,6 +101,13 @@ def read_splats(path: Path, origin: Tensor | None = None) -> Gaussians:
             return read_ply(Path(folder) / "plain.ply", origin)
     found = read_spz(path) if kind == "spz" else _parse_splat(path)
     return found if origin is None else _shift(found, -origin)
+
+
+def read_near(path: Path) -> tuple[Gaussians, Tensor]:
+    """What `read_splats` reads, relative to an origin (3,) float64 near them; zero where the file's is near."""
+    if path.suffix.lower() == ".ply":
+        return read_ply_near(path)
+    return read_splats(path), torch.zeros(3, dtype=torch.float64)
 
 
 def splat_transform(source: Path, target: Path, *, asked: Path) -> None:
@@ -121,7 +149,7 @@ def describe(path: Path) -> dict[str, Any]:
     Raises:
         SceneError, ConfigError: as `read_splats`.
     """
-    found = read_splats(path)
+    found, origin = read_near(path)
     n = len(found)
     about: dict[str, Any] = {"file": str(path), "bytes": path.stat().st_size, "gaussians": n}
     about["degree"] = found.degree
@@ -131,7 +159,7 @@ def describe(path: Path) -> dict[str, Any]:
             x.removeprefix("comment ") for x in head.splitlines() if x.startswith("comment ")
         ]
     if n:
-        means, scales = found.means.double(), found.log_scales.double().exp()
+        means, scales = found.means.double() + origin, found.log_scales.double().exp()
         opacity = found.opacity_logits.double().sigmoid()
         lower, upper = (torch.quantile(means[:: max(1, n // 100_000)], q, 0) for q in (0.01, 0.99))
         about |= {

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from visdom_plugin.atomic_files import write_bytes
-from visdom_plugin.errors import ConfigError, SceneError
+from visdom_plugin.errors import SceneError
 from visdom_plugin.export.splats import move
 from visdom_plugin.splat.gaussians import Gaussians
 
@@ -39,23 +39,12 @@ def write_spz(path: Path, gaussians: Gaussians, origin: Tensor | None = None) ->
 
     Args:
         origin: (3,) float64 of their frame in the frame the file shall have; None for the same frame.
-
-    Raises:
-        ConfigError: they lie so far from the origin that rounding is above a thousandth of their extent.
     """
     turned = move(gaussians.detach().to("cpu"), _AXES)
     arrays = {name: value.double().numpy() for name, value in turned.tensors().items()}
     means = arrays["means"] if origin is None else arrays["means"] + (_AXES[:3, :3] @ origin).numpy()
     farthest = max(float(np.abs(means).max(initial=0)), 1e-9)
-    finest = math.log2(_PLACES / farthest)
-    if len(means) > 1 and 2**-finest > 1e-3 * float(np.ptp(means, axis=0).max()):
-        raise ConfigError(
-            f"positions reach {farthest:.4g} from the origin, which SPZ's 24 bits cannot hold finely enough",
-            where=path,
-            cause="a capture in map coordinates, far from the origin",
-            todo="move it to the middle with --upright, or write --format ply",
-        )
-    bits = max(0, min(_MOST_BITS, math.floor(finest)))
+    bits = max(0, min(_MOST_BITS, math.floor(math.log2(_PLACES / farthest))))
     fixed = np.clip((means * (1 << bits)).round(), -_PLACES, _PLACES).astype("<i4")
     degree, n = turned.degree, len(turned)
     colours = arrays["sh"][:, 0] * _COLOUR + 127.5

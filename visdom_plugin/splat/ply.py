@@ -7,6 +7,7 @@ scale_0..2 (logarithms), rot_0..3 (w x y z). All are float, but x y z far from t
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from visdom_plugin.atomic_files import write_bytes
 from visdom_plugin.errors import SceneError, list_some
+from visdom_plugin.geometry.local_frame import is_near
 from visdom_plugin.splat.gaussians import Gaussians
 
 _TYPES = {
@@ -61,7 +63,16 @@ def read_ply(path: str | Path, origin: Tensor | None = None) -> Gaussians:
         SceneError: for a file that is missing, truncated, of another format, without the properties of 3DGS, or
             with places that are not finite.
     """
-    path = Path(path)
+    return _read(Path(path), origin)[0]
+
+
+def read_ply_near(path: str | Path) -> tuple[Gaussians, Tensor]:
+    """What `read_ply` reads, relative to an origin (3,) float64 near them; zero where the file's own is near."""
+    return _read(Path(path), "near")
+
+
+def _read(path: Path, origin: Tensor | Literal["near"] | None) -> tuple[Gaussians, Tensor]:
+    """Gaussians and the origin that their means are relative to."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -96,7 +107,11 @@ def read_ply(path: str | Path, origin: Tensor | None = None) -> Gaussians:
         return values
 
     places = np.stack([rows[name].astype(np.float64) for name in "xyz"], -1)
-    means = (places - (0 if origin is None else origin.numpy())).astype(np.float32)
+    if origin is None or isinstance(origin, str):
+        spread = float(np.ptp(places, axis=0).max(initial=0)) if count else 0.0
+        near = origin is None or not np.isfinite(spread) or is_near(places, spread)
+        origin = torch.from_numpy(np.zeros(3) if near else np.median(places, axis=0).round())
+    means = (places - origin.numpy()).astype(np.float32)
     rest = take("f_rest_", n_rest).reshape(count, 3, n_rest // 3).transpose(0, 2, 1)
     sh = np.concatenate([take("f_dc_", 3)[:, None], rest], 1)
     opacity = rows["opacity"].astype(np.float32)
@@ -109,7 +124,7 @@ def read_ply(path: str | Path, origin: Tensor | None = None) -> Gaussians:
             todo="export the file again",
         )
     arrays = (means, take("scale_", 3), take("rot_", 4), opacity, sh)
-    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays))
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays)), origin
 
 
 def _names(n_rest: int) -> list[str]:

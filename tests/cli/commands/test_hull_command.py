@@ -98,7 +98,14 @@ def test_files_hold_the_hull(scene, tmp_path, capsys):
     hull = Hull.load(tmp_path / "hull.npz")
     assert hull.voxels == report["voxels"] and np.allclose(hull.bounds, report["bounds"])
     assert capsys.readouterr().out == ""
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["hull.npz", "hull.ply"]
+    for ending in ("obj", "glb", "OBJ"):
+        assert main(["--resolution", "32", "--out", str(tmp_path / f"hull.{ending}"), "--quiet"]) == 0
+        other = trimesh.load(tmp_path / f"hull.{ending}", process=False, force="mesh")
+        assert other.is_watertight and other.area == pytest.approx(mesh.area, rel=1e-4)
+    names = ["hull.OBJ", "hull.glb", "hull.npz", "hull.obj", "hull.ply"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
+    assert main(["--out", str(tmp_path / "hull.stl")]) == 2
+    assert ".ply, .obj, .glb (mesh) or .npz" in capsys.readouterr().err
 
 
 def test_table_and_diagnosis(scene, capsys):
@@ -120,7 +127,7 @@ def test_table_and_diagnosis(scene, capsys):
         (["-k", "0"], "k is 0"),
         (["--agreement", "2"], "agreement is 2"),
         (["--resolution", "1"], "resolution is 1"),
-        (["--out", "hull.obj"], "hull.obj"),
+        (["--out", "hull.stl"], "hull.stl"),
         (["-k", "9"], "only 4 views"),
         (["one", "--data", "two"], "two scenes"),
         (["--bounds", "0", "0", "0", "0", "1", "1"], "bounds"),

@@ -210,7 +210,7 @@ def _write_splats(options: Options, target: Path) -> list[Path]:
 
     origin: Tensor | None = None
     if options.crop == "none" and not options.upright and not is_run(options.run):
-        gaussians = _read_plain(options.run)
+        gaussians, origin = _read_plain(options.run)
     else:
         subject = open_subject(options.run, options, options.device, test=False)
         gaussians, origin = _gaussians_of(options, subject)
@@ -227,10 +227,10 @@ def _write_splats(options: Options, target: Path) -> list[Path]:
     return [target]
 
 
-def _read_plain(path: Path) -> Gaussians:
-    from visdom_plugin.export.splat_files import read_splats
+def _read_plain(path: Path) -> tuple[Gaussians, Tensor]:
+    from visdom_plugin.export.splat_files import read_near
 
-    return read_splats(path)
+    return read_near(path)
 
 
 def _gaussians_of(options: Options, subject: Subject) -> tuple[Gaussians, Tensor]:

@@ -19,8 +19,11 @@ from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.settings import HullSettings
 
 if TYPE_CHECKING:
+    from visdom_plugin.hull.hull import Hull
     from visdom_plugin.scene import Scene
 
+ENDINGS = (".ply", ".obj", ".glb", ".npz")
+"""Of files that --out may name: meshes, and last the voxel grid."""
 _UNCOVERED = 0.9
 """Share of a mask below which the hull leaves it uncovered."""
 
@@ -29,7 +32,7 @@ _UNCOVERED = 0.9
 class Options(FolderOptions, HullSettings):
     """Carve the visible-domain hull of a scene from its cameras and masks.
 
-    Prints what it measured; --out writes the mesh (.ply) or the voxel grid (.npz).
+    Prints what it measured; --out writes the mesh (.ply, .obj, .glb) or the voxel grid (.npz).
     """
 
     k: Annotated[int | Literal["n-1", "auto"], tyro.conf.arg(aliases=["-k"])] = HullSettings.k
@@ -37,7 +40,7 @@ class Options(FolderOptions, HullSettings):
     inside: bool = False
     """Report and write, in place of the hull, the smoothest shape inside it that covers the masks as well."""
     out: Path | None = None
-    """File to write: .ply for the mesh, .npz for the grid."""
+    """File to write: .ply, .obj or .glb for the mesh, .npz for the grid."""
     masks_out: Path | None = None
     """Folder to write masks to: the hull's outline seen by each of --cameras, 8-bit PNG, white on the hull."""
     cameras: Literal["train", "test", "orbit"] = "test"
@@ -60,11 +63,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _main(argv: Sequence[str]) -> None:
     options = tyro.cli(Options, args=list(argv), prog="visdom-hull")
     folder = options.find_scene_folder()
-    if options.out is not None and options.out.suffix not in (".ply", ".npz"):
+    if options.out is not None and options.out.suffix.lower() not in ENDINGS:
         raise ConfigError(
             f"cannot write {options.out.name}",
             where="--out",
-            todo="name a .ply (mesh) or .npz (voxel grid) file",
+            todo=f"end the name in {', '.join(ENDINGS[:-1])} (mesh) or {ENDINGS[-1]} (voxel grid)",
         )
     names = [f.name for f in fields(VisibleDomain)]
     domain = VisibleDomain(**{name: getattr(options, name) for name in names})
@@ -165,7 +168,7 @@ def report_hull(
     if diagnosing:
         report["diagnosis"] = _diagnose(scene, report)
     if out is not None:
-        hull.write_ply(out) if out.suffix == ".ply" else hull.save(out)
+        _write(out, hull)
         report["out"] = str(out)
     if masks is not None:
         from visdom_plugin.cli.hulls.hull_masks import mask_cameras, write_masks
@@ -175,6 +178,16 @@ def report_hull(
         write_masks(hull, seen_by, files, masks.folder, poses=orbit, overwrite=masks.overwrite)
         report["masks_out"] = {"folder": str(masks.folder), "cameras": masks.cameras, "count": len(files)}
     return report
+
+
+def _write(path: Path, hull: Hull) -> None:
+    """The voxel grid as .npz, the mesh by any other ending."""
+    from visdom_plugin.export.meshes import Mesh, write_mesh
+
+    if path.suffix.lower() == ENDINGS[-1]:
+        hull.save(path)
+    else:
+        write_mesh(path, Mesh(*hull.to_mesh()))
 
 
 def _diagnose(scene: Scene, report: dict[str, Any]) -> dict[str, Any]:
