@@ -34,7 +34,7 @@ def random_cameras(random: np.random.Generator, count: int) -> Cameras:
     intrinsics[:, 0, 0], intrinsics[:, 1, 1] = random.uniform(10, 120, count), random.uniform(10, 120, count)
     intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (
         random.uniform(-0.2, 1.2, count) * width,
-        random.uniform(0, 1, count) * height,
+        random.uniform(0.1, 1, count) * height,  # a centre within a pixel of the corner is refused
     )
     intrinsics[:, 2, 2] = 1
     return Cameras.from_matrices(

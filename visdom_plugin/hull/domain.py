@@ -55,7 +55,8 @@ class VisibleDomain(HullSettings):
             cameras: (N,) Cameras.
             masks: N tensors or arrays (H, W) bool, True on the object, or one (N, H, W).
             ignore: N tensors or arrays (H, W) bool or None, True where nothing is known, or empty. Such a pixel
-                rules nothing out and asks for nothing.
+                rules nothing out and asks for nothing; but at least two views (one where K is 1) must know a
+                voxel to be inside their masks.
 
         Returns:
             Hull. Its summary tells rule, bounds, pieces and seconds.

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from tests.hull.balls import ball_masks, ring
+from visdom_plugin.geometry.cameras import project
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.check import check
 from visdom_plugin.hull.checks.coverage import measure_coverage
@@ -49,6 +50,24 @@ def test_unknown_rims_change_neither_hull_nor_findings(shape, capture):
         found, cameras, [m | g for m, g in zip(masks, unknown, strict=True)], unknown
     ):
         assert seen.covered > 0.97 and seen.inside > 0.97
+
+
+@pytest.mark.parametrize("components", ["all", "drop-small", "largest"])
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_what_only_unknown_rims_would_hold_is_not_kept(components, k, capture):
+    """Rims of several views meet in places where nothing was ever seen, and no culling takes these away."""
+    cameras, masks = capture
+    domain = VisibleDomain(resolution=48, components=components, k=k, bounds=((-2,) * 3, (2,) * 3))
+    unknown = [_rim(m) & ~m for m in masks]
+    hull, found = domain.carve(cameras, masks), domain.carve(cameras, masks, unknown)
+    assert found.volume < 1.05 * hull.volume or k == 1
+    centres = found.bounds[0] + (np.argwhere(found.occupancy) + 0.5) * found.voxel_size
+    known = torch.zeros(len(centres))
+    for uv, depth, mask in zip(*project(cameras, torch.from_numpy(centres)), masks, strict=True):
+        inside = (depth > 0) & (uv >= 0).all(-1) & (uv < 64).all(-1)
+        column, row = uv.clamp(0, 63).long().unbind(-1)
+        known += inside & mask[row, column]
+    assert (known >= min(k, 2)).all()
 
 
 def test_taken_for_object_they_would_be_faults(capture):

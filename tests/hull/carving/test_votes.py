@@ -52,6 +52,29 @@ def test_blocks_equal_dense_vote(seed):
 
 
 @given(st.integers(0, 10**9))
+@settings(max_examples=40, deadline=None)
+def test_unknown_pixels_count_alike_in_every_vote(seed):
+    """Blocks, cells, centres and the dense vote: an unknown pixel is a hit, and two views must know better."""
+    random, cameras, masks, grid, rule = random_case(seed)
+    ignore = [None if random.random() < 0.3 else np.roll(m, 3, 1) ^ m for m in masks]
+    silhouettes = gather_silhouettes(cameras, masks, ignore)
+    hits = [m if g is None else m | g for m, g in zip(masks, ignore, strict=True)]
+    surely = [m if g is None else m & ~g for m, g in zip(masks, ignore, strict=True)]
+    occupied, visible = count_votes(gather_silhouettes(cameras, hits), grid)
+    known, _ = count_votes(gather_silhouettes(cameras, surely), grid)
+    table = rule.table().astype(bool)
+    wanted = table[visible.numpy().astype(int), occupied.numpy().astype(int)]
+    if any(g is not None for g in ignore):
+        wanted &= known.numpy() >= min(2, rule.least_visible or rule.least_occupied)
+    assert np.array_equal(block_carve(silhouettes, grid, rule), wanted)
+    assert np.array_equal(dense_carve(silhouettes, grid, rule).numpy(), wanted)
+    cells = np.stack(np.unravel_index(np.arange(wanted.size), wanted.shape), -1)
+    assert np.array_equal(keep_centres(silhouettes, grid, rule, cells), wanted.reshape(-1))
+    states = classify_cells(silhouettes, sum_areas(silhouettes), grid, rule, cells)
+    assert not wanted.reshape(-1)[states == DROPPED].any() and wanted.reshape(-1)[states == KEPT].all()
+
+
+@given(st.integers(0, 10**9))
 @settings(max_examples=25, deadline=None)
 def test_dense_vote_equals_projection_of_every_centre(seed):
     _, cameras, masks, grid, rule = random_case(seed)

@@ -16,7 +16,7 @@ import numpy as np
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.hull.carving.keep_rule import KeepRule
-from visdom_plugin.hull.carving.octree import Areas, sum_areas
+from visdom_plugin.hull.carving.octree import Areas
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes, axis_terms
 from visdom_plugin.hull.grid.components import Pieces
 
@@ -76,10 +76,8 @@ def explaining_pieces(
     """
     if len(pieces.sizes) < 2:
         return np.ones(len(pieces.sizes), bool)
-    if silhouettes.unknown is not None:
-        # Pixels at which nothing is known ask for no piece.
-        silhouettes = silhouettes.demanding()
-        areas = sum_areas(silhouettes)
+    # Pixels at which nothing is known ask for no piece.
+    silhouettes, areas = silhouettes.demanding(), areas.known or areas
     thin = 2 if max(occupancy.shape) > _FINE else 1
     thin *= 2 if max(occupancy.shape) > 2 * _FINE else 1
     stretch = np.where(pieces.sizes >= _LARGE, thin, 1)
@@ -140,7 +138,7 @@ def _list_shell(
 
 def _lay_out(silhouettes: Silhouettes, areas: Areas, edge_px: np.ndarray, about: np.ndarray) -> _Canvas:
     """Working pixels as large as a voxel at the point `about` (3,); `edge_px` (N,) is its edge at depth 1."""
-    tables, starts = areas
+    tables, starts, _ = areas
     depth = np.abs(silhouettes.projections[:, 2] @ np.append(about, 1.0))
     factors = np.clip(edge_px / np.maximum(depth, 1e-12), 1, silhouettes.sizes.min(1)).astype(np.int64)
     inner = -(-silhouettes.sizes // factors[:, None])

@@ -35,6 +35,15 @@ class KeepRule(NamedTuple):
         agreement = None if settings.max_misses is not None else as_fraction(settings.agreement)
         return cls(views, k if settings.kind == "visdom" else 1, agreement, settings.max_misses)
 
+    def of_known(self) -> KeepRule:
+        """The rule for votes in which pixels at which nothing is known count as misses.
+
+        Such a pixel counts as a hit in the rule itself, so that it carves nothing. What no view knows to be
+        object, or only one where K asks for several, is then kept by them alone.
+        """
+        least = self.least_visible if self.least_occupied is None else self.least_occupied
+        return KeepRule(self.views, 0, None, least_occupied=min(max(least, 1), 2))
+
     def keeps(self, visible: int, occupied: int) -> bool:
         """Whether a voxel seen by `visible` views and inside the mask of `occupied` of them stays."""
         if self.least_occupied is not None:

@@ -9,6 +9,8 @@ the rounding error of the projection, so the result equals the dense vote bit fo
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
@@ -21,8 +23,20 @@ _UNSEEN, _EMPTY, _FULL, _OPEN = 0, 1, 2, 3
 _TOP, _LEAF = 32, 4
 _GRAIN = 2048
 
-Areas = tuple[np.ndarray, np.ndarray]
-"""Summed-area tables and where each starts, from `sum_areas`."""
+
+class Areas(NamedTuple):
+    """Summed-area tables of all masks, from `sum_areas`."""
+
+    tables: np.ndarray
+    """Flat int32; entry (r, c) of a view's table sums rows < r and columns < c."""
+    starts: np.ndarray
+    """(N,) int64 where each view's begins."""
+    known: Areas | None = None
+    """Those of what is known to be object, where there are pixels at which nothing is known."""
+
+    def of_ballots(self) -> tuple[Areas, ...]:
+        """One for each of `Silhouettes.ballots`."""
+        return (self,) if self.known is None else (self, self.known)
 
 
 @kernel()
@@ -46,16 +60,13 @@ def _sum_areas(
 
 
 def sum_areas(silhouettes: Silhouettes) -> Areas:
-    """Summed-area tables of all masks, flat int32, and where each starts.
-
-    Entry (r, c) of a table sums rows < r and columns < c.
-    """
+    """Summed-area tables of all masks."""
     counts = (silhouettes.sizes + 1).prod(1)
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
     tables = np.empty(int(counts.sum()), np.int32)
     inputs = (silhouettes.pixels, silhouettes.sizes, silhouettes.offsets, starts)
     parallel_for(_sum_areas, len(silhouettes), 1, *inputs, tables)
-    return tables, starts
+    return Areas(tables, starts, None if silhouettes.unknown is None else sum_areas(silhouettes.demanding()))
 
 
 def rounding_bounds(terms: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -169,11 +180,14 @@ def classify_cells(
         (M,) uint8: DROPPED or KEPT where it holds for every point of the cell, else MIXED.
     """
     terms = axis_terms(silhouettes.projections, [grid.planes(a) for a in range(3)])
-    tables, starts = areas
-    states = np.empty(len(cells), np.uint8)
-    inputs = (cells, *terms, rounding_bounds(terms), silhouettes.sizes, starts, tables, rule.table())
-    parallel_for(_classify, len(cells), _GRAIN, *inputs, states)
-    return states
+    said = []
+    for (_, its_rule), (tables, starts, _) in zip(silhouettes.ballots(rule), areas.of_ballots(), strict=True):
+        states = np.empty(len(cells), np.uint8)
+        inputs = (cells, *terms, rounding_bounds(terms), silhouettes.sizes, starts, tables, its_rule.table())
+        parallel_for(_classify, len(cells), _GRAIN, *inputs, states)
+        said.append(states)
+    # Dropped by one is dropped, and mixed is all that is kept by one and not by the other.
+    return np.where(np.minimum.reduce(said) == DROPPED, DROPPED, np.maximum.reduce(said)).astype(np.uint8)
 
 
 @kernel()
@@ -200,10 +214,13 @@ def _keep_centres(
 def keep_centres(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, cells: np.ndarray) -> np.ndarray:
     """(M,) bool: what the rule says of the centres of some cells (M, 3) of a grid."""
     terms = axis_terms(silhouettes.projections, [grid.centres(a) for a in range(3)])
-    kept = np.empty(len(cells), np.bool_)
-    inputs = (cells, *terms, silhouettes.sizes, silhouettes.offsets, silhouettes.pixels, rule.table())
-    parallel_for(_keep_centres, len(cells), _GRAIN, *inputs, kept)
-    return kept
+    every = np.ones(len(cells), np.bool_)
+    for ballot, its_rule in silhouettes.ballots(rule):
+        kept = np.empty(len(cells), np.bool_)
+        inputs = (cells, *terms, ballot.sizes, ballot.offsets, ballot.pixels, its_rule.table())
+        parallel_for(_keep_centres, len(cells), _GRAIN, *inputs, kept)
+        every &= kept
+    return every
 
 
 @kernel()
@@ -331,9 +348,14 @@ def block_carve(
         (X, Y, Z) bool.
     """
     terms = axis_terms(silhouettes.projections, [grid.centres(a) for a in range(3)])
-    tables, starts = sum_areas(silhouettes) if areas is None else areas
-    out = np.zeros(grid.shape, np.uint8)
+    areas = sum_areas(silhouettes) if areas is None else areas
     blocks = int(np.prod([-(-n // _TOP) for n in grid.shape]))
-    inputs = (silhouettes.sizes, silhouettes.offsets, silhouettes.pixels, starts, tables, rule.table())
-    parallel_for(_carve, blocks, 4, *terms, rounding_bounds(terms), *inputs, out)
-    return out.view(bool)
+    kept = []
+    for (ballot, its_rule), (tables, starts, _) in zip(
+        silhouettes.ballots(rule), areas.of_ballots(), strict=True
+    ):
+        out = np.zeros(grid.shape, np.uint8)
+        inputs = (ballot.sizes, ballot.offsets, ballot.pixels, starts, tables, its_rule.table())
+        parallel_for(_carve, blocks, 4, *terms, rounding_bounds(terms), *inputs, out)
+        kept.append(out.view(bool))
+    return kept[0] if len(kept) == 1 else kept[0] & kept[1]

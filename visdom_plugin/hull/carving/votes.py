@@ -82,6 +82,11 @@ class Silhouettes:
             return self
         return replace(self, pixels=self.pixels & (1 - self.unknown), unknown=None)
 
+    def ballots(self, rule: KeepRule) -> list[tuple[Silhouettes, KeepRule]]:
+        """Silhouettes without unknown pixels, each with a rule that a voxel has to satisfy."""
+        known = [] if self.unknown is None else [(self.demanding(), rule.of_known())]
+        return [(replace(self, unknown=None), rule), *known]
+
 
 def gather_silhouettes(
     cameras: Cameras, masks: Masks, ignore: Sequence[Tensor | np.ndarray | None] = (), *, dilate_px: int = 0
@@ -192,6 +197,9 @@ def count_votes(
 
 def dense_carve(silhouettes: Silhouettes, grid: Grid, rule: KeepRule, device: Device = "cpu") -> Tensor:
     """(X, Y, Z) bool on `device`: the voxels that satisfy the rule."""
-    occupied, visible = count_votes(silhouettes, grid, device)
-    table = torch.from_numpy(rule.table().astype(bool)).to(device)
-    return table.flatten()[visible.int() * table.shape[1] + occupied.int()]
+    kept = torch.ones(grid.shape, dtype=torch.bool, device=device)
+    for ballot, its_rule in silhouettes.ballots(rule):
+        occupied, visible = count_votes(ballot, grid, device)
+        table = torch.from_numpy(its_rule.table().astype(bool)).to(device)
+        kept &= table.flatten()[visible.int() * table.shape[1] + occupied.int()]
+    return kept
