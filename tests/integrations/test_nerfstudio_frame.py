@@ -72,7 +72,9 @@ def test_points_on_rays_are_the_same_points(seed):
     along = frame.points_to_world(origins) + t / frame.scale * frame.directions_to_world(directions)
     there = frame.points_to_world(origins + t * directions)
     assert torch.allclose(along, there, rtol=1e-9, atol=1e-9)
-    assert torch.allclose(frame.directions_to_world(directions).norm(dim=-1), directions.norm(dim=-1))
+    turned = frame.directions_to_world(directions)
+    assert torch.allclose(turned.norm(dim=-1), directions.norm(dim=-1))
+    assert torch.allclose(frame.directions_to_model(turned), directions, atol=1e-12)
 
 
 @seeds

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.geometry.rotations import slerp
@@ -40,6 +40,13 @@ def interpolate(start: Cameras, end: Cameras, t: Tensor | float, look_at: Tensor
     other = end.resized(start.width, start.height)
     intrinsics = torch.lerp(start.intrinsics, other.intrinsics, t[..., None, None])
     return Cameras(intrinsics, motion, start.width, start.height)
+
+
+def draw_between(cameras: Cameras, look_at: Tensor, generator: Generator | None) -> Cameras:
+    """A camera between a random pair of training cameras, uniform in the pair and on the way."""
+    first, second = torch.randperm(len(cameras), generator=generator)[:2].tolist()
+    t = torch.rand((), generator=generator)
+    return interpolate(cameras[first], cameras[second], t, look_at)
 
 
 def look_at_camera(centre: Tensor, target: Tensor, up: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
@@ -87,6 +88,47 @@ class SampleFilter(Protocol):
 def sample_filters(hooks: Sequence[object]) -> list[SampleFilter]:
     """The hooks that have a say about single samples."""
     return [hook for hook in hooks if isinstance(hook, SampleFilter) and hook.drop_outside]
+
+
+class EmptyRays(NamedTuple):
+    """Rays along which there is nothing, because they miss the hull."""
+
+    origins: Tensor
+    """(n, 3) float32, in the frame of the training cameras."""
+    directions: Tensor
+    """(n, 3) float32, unit."""
+    radii: Tensor
+    """(n,) float32 radius of a pixel's cone at distance 1, of a training view's pixels."""
+
+
+@runtime_checkable
+class EmptySpace(Protocol):
+    """What a sampler hook may offer besides: rays along which a method is to learn that there is nothing.
+
+    A method adds `virtual_weight` times the mean cross entropy between their opacity and 0 (`losses.mask_loss`) to
+    its loss. They are sampled within the method's own bounds, without any hook's.
+    """
+
+    @property
+    def virtual_weight(self) -> float:
+        """Weight of that loss; at 0 rays need not be asked for."""
+        ...
+
+    def empty_rays(
+        self, photographed: int, generator: Generator | None = None, device: torch.device | None = None
+    ) -> EmptyRays:
+        """The rays of a step that has `photographed` rays of photographs; there may be none.
+
+        Args:
+            generator: CPU generator that draws them; the default is torch's global one.
+            device: where they are wanted, the CPU by default.
+        """
+        ...
+
+
+def empty_spaces(hooks: Sequence[object]) -> list[EmptySpace]:
+    """The hooks that want rays of empty space trained."""
+    return [hook for hook in hooks if isinstance(hook, EmptySpace) and hook.virtual_weight > 0]
 
 
 class Placed(Protocol):

@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.geometry.camera_paths import interpolate
+from visdom_plugin.geometry.camera_paths import draw_between
 from visdom_plugin.geometry.cameras import Cameras, project, require_batch
 from visdom_plugin.geometry.local_frame import is_near
 from visdom_plugin.hooks.protocols import Placed
@@ -202,9 +202,7 @@ class VisDomGaussianRegularizer:
 
     def sample_camera(self, generator: Generator | None = None) -> Cameras:
         """One camera between a random pair of training cameras, uniform in the pair and on the way."""
-        first, second = torch.randperm(len(self.cameras), generator=generator)[:2].tolist()
-        t = torch.rand((), generator=generator)
-        return interpolate(self.cameras[first], self.cameras[second], t, self._look_at)
+        return draw_between(self.cameras, self._look_at, generator)
 
     def loss(
         self,

@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import Cameras, rays_of_pixels
 from visdom_plugin.hooks import torch_ops
-from visdom_plugin.hooks.protocols import RayBounds
+from visdom_plugin.hooks.protocols import EmptyRays, RayBounds
 from visdom_plugin.hooks.settings import SamplerSettings
+from visdom_plugin.hooks.virtual_views import OutsideRays, virtual_views
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.raycast import Crossing, cast
 
@@ -123,12 +124,34 @@ class VisDomSampler:
                 "'entry_exit', missing 'full' or 'skip'"
             )
         self.epsilon_world = epsilon = float(_epsilon_world(config, hull, cameras))
+        if not (
+            config.virtual_views in ("none", "between", "midpoints")
+            and 0 <= config.virtual_weight < float("inf")
+            and 0 < config.virtual_rays < float("inf")
+        ):
+            raise ConfigError(
+                f"virtual_views={config.virtual_views!r}, virtual_weight={config.virtual_weight}, "
+                f"virtual_rays={config.virtual_rays}: virtual_views must be 'none', 'between' or 'midpoints', "
+                "virtual_weight 0 or more, virtual_rays above 0",
+                where="VisDomSampler",
+            )
         if not 0 <= epsilon < float("inf") or (config.interval == "first_hit" and epsilon == 0):
             raise ConfigError(
                 f"epsilon = {epsilon:g} scene units leaves no band to sample",
                 cause="an empty hull, or an epsilon that is negative, zero or not a number",
                 todo="give a positive epsilon_camera_distances, epsilon_hull_radii or epsilon_world",
             )
+        self._outside: OutsideRays | None = None
+        if config.virtual_views != "none":
+            if cameras is None or len(cameras) < 2:
+                raise ConfigError(
+                    f"virtual_views={config.virtual_views!r} needs at least two training cameras to stand between",
+                    where="VisDomSampler",
+                    todo="pass the batch of all training cameras: VisDomSampler(hull, cameras=cameras, ...)",
+                )
+            here = cameras.to("cpu")
+            look_at = torch.as_tensor(hull.centre).to(here.world_from_camera)
+            self._outside = OutsideRays(hull, virtual_views(here, config.virtual_views, look_at))
         self._pixels: _Pixels | None = None
         self._number = torch_ops.enter(self)
 
@@ -136,6 +159,36 @@ class VisDomSampler:
     def drop_outside(self) -> bool:
         """Whether `keep` has a say: a method that can shall then ask it about each sample."""
         return self.config.drop_outside
+
+    @property
+    def virtual_weight(self) -> float:
+        """Weight of the loss on `empty_rays`; 0 where there are no virtual views."""
+        return 0.0 if self._outside is None else self.config.virtual_weight
+
+    def empty_rays(
+        self, photographed: int, generator: Generator | None = None, device: torch.device | None = None
+    ) -> EmptyRays:
+        """Rays of virtual views that miss the hull, `virtual_rays` for each of `photographed` ones.
+
+        Three lines in any trainer, besides those that bound its rays:
+
+            rays = sampler.empty_rays(len(batch))
+            alpha = opacity(rays.origins, rays.directions)   # within the trainer's own near and far
+            loss = loss + sampler.virtual_weight * mask_loss(alpha, torch.zeros_like(alpha))
+
+        Args:
+            generator: CPU generator that draws them; the default is torch's global one.
+            device: where they are wanted, the CPU by default.
+
+        Raises:
+            ConfigError: the sampler was made without virtual views.
+        """
+        if self._outside is None:
+            raise ConfigError(
+                "the sampler has no virtual views", todo='make it with virtual_views="between" or "midpoints"'
+            )
+        count = max(1, round(self.config.virtual_rays * photographed))
+        return self._outside.draw(count, generator, device or torch.device("cpu"))
 
     def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__.update(state)

@@ -25,6 +25,17 @@ class SamplerSettings:
     """Novel views, too, are sampled inside the band only, and rays that miss show the background."""
     drop_outside: bool = False
     """Of the samples in the band, those at points outside the hull count nothing (VaxNeRF; Instant-NGP only)."""
+    virtual_views: Literal["none", "between", "midpoints"] = "none"
+    """Rays of views that nobody photographed train the field to be empty where they miss the hull. "between": 64
+    places on the way between random pairs of training cameras, that swing round the hull; "midpoints": halfway
+    between each camera and its two nearest ones, as in the VisDom authors' release. Photographs are not needed for
+    it: such a ray adds no colour loss, and is sampled over the method's full range, not in the band."""
+    virtual_weight: float = 0.1
+    """Weight of the cross entropy between the opacity along these rays and 0; 0.1 is the release's, that of its
+    silhouette loss."""
+    virtual_rays: float = 0.25
+    """How many of them there are in a step, for each ray of the photographs. The release draws its batch from all
+    views alike, 1 to 2 for each, of which those that meet the hull are wasted; here all miss it."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from nerfstudio.model_components.scene_colliders import NearFarCollider
 
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import SamplerConfig
+from visdom_plugin.hull.queries.raycast import cast
 from visdom_plugin.integrations.nerfstudio import fields, methods
 from visdom_plugin.integrations.nerfstudio.dataparser import METADATA
 from visdom_plugin.integrations.nerfstudio.rays import bound_model_rays
@@ -158,6 +159,31 @@ def test_samples_of_training_rays_lie_in_the_hulls_band(train, batch):
     inside = frame.points_to_world(middle).numpy()
     assert 0.05 < hit.float().mean() < 0.95
     assert ((inside > box[0]) & (inside < box[1])).all()
+
+
+def test_rays_of_virtual_views_are_trained_to_be_empty(train, batch, monkeypatch):
+    on = SamplerConfig(enabled=True, virtual_views="midpoints", virtual_weight=0.5)
+    model = build(fields.NerfactoVdConfig(**TINY, hull=HULL, vd=on), train).train()
+    seen = []
+    inner = model.get_outputs
+    monkeypatch.setattr(
+        model, "get_outputs", lambda bundle: seen.append((bundle, inner(bundle))) or seen[-1][1]
+    )
+    _, losses = step(model, train, batch)
+    (photographs, _), (nothing, drawn) = seen
+    assert len(photographs) == 200 and len(nothing) == 50
+    hook, frame = model.collider.hook, model.collider.frame
+    world = frame.points_to_world(nothing.origins), frame.directions_to_world(nothing.directions)
+    assert not cast(hook.hull, *world).hit.any()
+    # Between nerfacto's own bounds, which reach behind the hull.
+    assert torch.equal(nothing.nears, torch.full((50, 1), 0.05)) and (nothing.fars > 100).all()
+    by_hand = 0.5 * -(1 - drawn["accumulation"].detach().double()).log().mean()
+    assert losses["empty_loss"].item() == pytest.approx(by_hand.item(), rel=1e-3)
+    losses["empty_loss"].backward()
+    assert any(p.grad is not None and bool(p.grad.any()) for p in model.field.parameters())
+    seen.clear()
+    model.eval()(pixel_rays(train)[:10])
+    assert len(seen) == 1
 
 
 def test_another_data_parser_is_told(train, capsys):

@@ -13,12 +13,12 @@ from datamodules.synthetic.scene import make_scene
 from method_configs.corgs_lite import SPEC
 from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.errors import SceneError
-from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.camera_paths import draw_between, look_at_camera
 from visdom_plugin.geometry.cameras import Cameras, look_at_point, project
 from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.splats.corgs_lite import CorgsLite, co_regularisation, unmatched
-from visdom_plugin.methods.splats.pseudo_views import draw_between, draw_on_ellipse, fit_ellipse
+from visdom_plugin.methods.splats.pseudo_views import draw_on_ellipse, fit_ellipse
 from visdom_plugin.seeding import generator
 from visdom_plugin.training.batches import DataManager
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import SamplerConfig
-from visdom_plugin.hooks.protocols import SamplerHook
+from visdom_plugin.hooks.protocols import EmptySpace, SamplerHook, empty_spaces
 from visdom_plugin.hull.domain import TRAINING_DOMAIN, VisibleDomain
 from visdom_plugin.integrations.nerfstudio.dataparser import METADATA, told
 from visdom_plugin.integrations.nerfstudio.frame import Similarity
@@ -105,6 +105,13 @@ def rgba_mask_loss(accumulation: Tensor, image: Tensor) -> Tensor:
         return mask_loss(accumulation[..., 0].float(), image[..., 3].to(accumulation.device).float())
 
 
+def zero_opacity_loss(accumulation: Tensor) -> Tensor:
+    """Binary cross entropy between opacity (n, 1) and 0."""
+    with torch.autocast(accumulation.device.type, enabled=False):
+        alpha = accumulation[..., 0].float()
+        return mask_loss(alpha, torch.zeros_like(alpha))
+
+
 class _HullField(Model):
     """What both methods get; stands before the model's own class."""
 
@@ -137,7 +144,29 @@ class _HullField(Model):
             with told():
                 loss = rgba_mask_loss(outputs["accumulation"], batch["image"].to(self.device))
             losses["mask_loss"] = self.config.mask_weight * loss
+        if self.training and isinstance(self.collider, HullCollider):
+            for hook in empty_spaces([self.collider.hook]):
+                alpha = self._opacity_of_nothing(hook, len(outputs["accumulation"]))
+                if len(alpha):
+                    losses["empty_loss"] = hook.virtual_weight * zero_opacity_loss(alpha)
         return losses
+
+    def _opacity_of_nothing(self, hook: EmptySpace, photographed: int) -> Tensor:
+        """(n, 1) along rays of empty space, sampled between the method's own bounds; n may be 0."""
+        assert isinstance(self.collider, HullCollider)
+        rays = hook.empty_rays(photographed, device=self.device)
+        if not len(rays.origins):
+            return rays.radii[:, None]
+        frame = self.collider.frame
+        bundle = RayBundle(
+            origins=frame.points_to_model(rays.origins),
+            directions=frame.directions_to_model(rays.directions),
+            # Of a square as large as the pixel, whose radius is 2 / sqrt(12) of its side.
+            pixel_area=(3 * rays.radii.square())[:, None],
+            # No colour is looked at, so any photograph's appearance will do.
+            camera_indices=torch.zeros_like(rays.radii[:, None], dtype=torch.int64),
+        )
+        return self.get_outputs(self.collider.own(bundle))["accumulation"]
 
 
 @dataclass

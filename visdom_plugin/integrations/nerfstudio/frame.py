@@ -37,6 +37,10 @@ class Similarity(NamedTuple):
         """(..., 3) turned, their length kept; float64. t along them is in world units: t_model / scale."""
         return model.double() @ self._parts(model)[0]
 
+    def directions_to_model(self, world: Tensor) -> Tensor:
+        """(..., 3) turned, their length kept, in the directions' dtype and on their device."""
+        return (world.double() @ self._parts(world)[0].mT).to(world)
+
     def poses_to_model(self, cameras: Cameras) -> Tensor:
         """(..., 3, 4) camera-to-model matrices in OpenGL's axes, float64."""
         motion = cameras.world_from_camera.double()

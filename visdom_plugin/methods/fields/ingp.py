@@ -93,8 +93,14 @@ class Ingp(RadianceField[IngpConfig]):
         losses = {"colour": torch.nn.functional.huber_loss(rgb, target, delta=HUBER_DELTA) / HUBER_DELTA}
         if c.mask_weight:
             losses["mask"] = c.mask_weight * silhouette_loss(alpha, batch)
-        losses |= self.prior_losses(step)
+        losses |= self.prior_losses(step) | self.empty_losses(n, step)
         return StepOutput(losses, {"psnr": psnr_of(rgb - target)})
+
+    def opacity(self, rays: LocalRays, radius: Tensor, step: int, generator: Generator) -> Tensor:
+        step_length = torch.full_like(rays.far, self.config.missing_step_length)
+        shift = uniform(generator, self.device, len(rays.far))
+        samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks)
+        return self._shade(rays, samples, rays.origins.new_ones(len(rays.far), 3))[1]
 
     def optimise(self, step: int, output: StepOutput) -> None:
         c = self.config

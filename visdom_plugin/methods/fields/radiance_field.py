@@ -11,8 +11,9 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras, pixel_radius
-from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook
+from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook, empty_spaces
 from visdom_plugin.hull.hull import Hull
+from visdom_plugin.losses import mask_loss
 from visdom_plugin.methods.fields.common import LocalRays, bound_rays, render_image, spread_rays
 from visdom_plugin.methods.fields.configs import IngpConfig, ZipNerfConfig
 from visdom_plugin.methods.fields.shape_prior import ShapePrior
@@ -20,7 +21,7 @@ from visdom_plugin.nerf.frame import frame_of
 from visdom_plugin.nerf.optimiser import FieldOptimiser
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
-from visdom_plugin.seeding import generator, uniform
+from visdom_plugin.seeding import draw_on, generator, uniform
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
 Config = TypeVar("Config", IngpConfig, ZipNerfConfig)
@@ -114,6 +115,31 @@ class RadianceField(ABC, Generic[Config]):
             return {}
         loss = self.prior.loss(self.density, generator(self.seed, "prior", step))
         return {"prior": self.config.prior_weight * loss}
+
+    @abstractmethod
+    def opacity(self, rays: LocalRays, radius: Tensor, step: int, generator: Generator) -> Tensor:
+        """(n,) opacity along rays in a training step, with gradients.
+
+        Args:
+            radius: (n,) of the pixels' cones at distance 1.
+            generator: on the method's device, draws where samples lie.
+        """
+
+    def empty_losses(self, photographed: int, step: int) -> dict[str, Tensor]:
+        """The loss that hooks ask for along rays of empty space, by name; none where they ask for none.
+
+        Args:
+            photographed: rays of photographs in the step.
+        """
+        losses = []
+        for i, hook in enumerate(empty_spaces(self.hooks)):
+            draw = generator(self.seed, "empty", i, step)
+            empty = hook.empty_rays(photographed, draw, self.device)
+            if len(empty.origins):
+                rays = self.bound(empty.origins, empty.directions, [])
+                alpha = self.opacity(rays, empty.radii, step, draw_on(self.device, draw))
+                losses.append(hook.virtual_weight * mask_loss(alpha, torch.zeros_like(alpha)))
+        return {"empty": sum(losses[1:], losses[0])} if losses else {}
 
     def draw_background(self, n: int, generator: Generator) -> Tensor:
         """(n, 3) behind the photographs of a training step."""

@@ -133,8 +133,8 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         draw = draw_on(self.device, generator(self.seed, "step", step))
         background = self.draw_background(len(batch.mask), draw)
         rays = self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
-        progress = step / max(c.steps, 1)
-        levels, colours = self._see(rays, batch.radii, c.samples, progress, draw)
+        levels, out = self._see(rays, batch.radii, c.samples, step, draw)
+        colours = self._shade(out[..., 1:], rays.directions[:, None])
         last = levels[-1]
         rgb, alpha, _ = composite(last.weights, colours, last.t, background)
         target = photograph_on(background, batch, alpha)
@@ -157,8 +157,12 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         if c.hash_decay:
             grids = (self._grid(name).decay() for name in LEVELS)
             losses["hash_decay"] = c.hash_decay * reduce(torch.add, grids)
-        losses |= self.prior_losses(step)
+        losses |= self.prior_losses(step) | self.empty_losses(len(batch.mask), step)
         return StepOutput(losses, {"psnr": psnr_of(error)})
+
+    def opacity(self, rays: LocalRays, radius: Tensor, step: int, generator: Generator) -> Tensor:
+        levels, _ = self._see(rays, radius, self.config.samples, step, generator)
+        return levels[-1].weights.sum(-1)
 
     def optimise(self, step: int, output: StepOutput) -> None:
         c = self.config
@@ -182,15 +186,15 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         return near, torch.full_like(near, self.config.far)
 
     def _see(
-        self, rays: LocalRays, radius: Tensor, counts: Sequence[int], progress: float, generator: Generator
+        self, rays: LocalRays, radius: Tensor, counts: Sequence[int], step: int, generator: Generator
     ) -> tuple[list[Level], Tensor]:
-        """All levels along rays, and the field's colours (n, S, 3). Samples are jittered by the generator."""
-        level = None
+        """All levels along rays in a training step, and the field's outputs (n, S, ...), as `_look` has them."""
+        level, progress = None, step / max(self.config.steps, 1)
         levels = []
         for name, count in zip(LEVELS, counts, strict=True):
             level, out = self._look(name, rays, radius, level, count, progress, generator)
             levels.append(level)
-        return levels, self._shade(out[..., 1:], rays.directions[:, None])
+        return levels, out
 
     def _look(
         self,

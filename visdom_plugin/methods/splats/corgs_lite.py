@@ -15,13 +15,14 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin import seeding
+from visdom_plugin.geometry.camera_paths import draw_between
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.losses import photometric_loss
 from visdom_plugin.methods.splats.common import draw_background, drop_some, fit_view
 from visdom_plugin.methods.splats.configs import CorgsConfig
 from visdom_plugin.methods.splats.initial_points import draw_box, draw_points
-from visdom_plugin.methods.splats.pseudo_views import draw_between, draw_on_ellipse, fit_ellipse
+from visdom_plugin.methods.splats.pseudo_views import draw_on_ellipse, fit_ellipse
 from visdom_plugin.methods.splats.splat_method import SplatMethod
 from visdom_plugin.methods.splats.strategy import Schedule, Strategy, every
 from visdom_plugin.render import Render

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.geometry.camera_paths import interpolate, look_at_camera
+from visdom_plugin.geometry.camera_paths import look_at_camera
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 
 HEIGHT_VARIATION = 0.1
@@ -84,10 +84,3 @@ def fit_ellipse(cameras: Cameras) -> Ellipse:
 def draw_on_ellipse(ellipse: Ellipse, generator: Generator) -> Cameras:
     """A camera at a uniform angle."""
     return ellipse.camera(2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64))
-
-
-def draw_between(cameras: Cameras, look_at: Tensor, generator: Generator) -> Cameras:
-    """A camera between a random pair of training cameras, uniform in the pair and on the way."""
-    first, second = torch.randperm(len(cameras), generator=generator)[:2].tolist()
-    t = torch.rand((), generator=generator)
-    return interpolate(cameras[first], cameras[second], t, look_at)

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import torch
 from torch import Generator, Tensor
 
+from visdom_plugin.geometry.camera_paths import draw_between
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.photo_warp import PhotoWarp
-from visdom_plugin.methods.splats.pseudo_views import draw_between
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 
