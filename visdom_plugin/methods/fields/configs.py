@@ -20,6 +20,9 @@ class FieldConfig(SamplerMethodConfig):
     soft prior that space is empty there. Needs a hull."""
     inside: InsideConfig = field(default_factory=InsideConfig)
     """How that shape is found."""
+    colour_correction: bool = False
+    """Fit an affine map of colours to each training view, for captures whose exposure or white balance changes;
+    novel views have the colours of the average one."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -88,6 +88,7 @@ class Ingp(RadianceField[IngpConfig]):
         shift = uniform(draw, self.device, n)
         samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks)
         rgb, alpha, _ = self._shade(rays, samples, background)
+        rgb = self.correct(rgb, alpha, background, batch.pixels)
         target = photograph_on(background, batch, alpha)
         self._adapt(n, len(samples.ray))
         losses = {"colour": torch.nn.functional.huber_loss(rgb, target, delta=HUBER_DELTA) / HUBER_DELTA}
@@ -108,6 +109,7 @@ class Ingp(RadianceField[IngpConfig]):
             step, c.steps, base=c.lr, warm_up=c.lr_warm_up, factor=c.lr_factor, at=(0.5, 0.75, 0.9)
         )
         self.optimiser.step(lr)
+        self.step_correction(step)
 
     def render_rays(
         self, origins: Tensor, directions: Tensor, radius: Tensor, background: Tensor

@@ -14,6 +14,7 @@ from visdom_plugin.geometry.cameras import Cameras, pixel_radius
 from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook, empty_spaces
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.losses import mask_loss
+from visdom_plugin.methods.colour_correction import ColourCorrection, CorrectsColours
 from visdom_plugin.methods.fields.common import LocalRays, bound_rays, render_image, spread_rays
 from visdom_plugin.methods.fields.configs import IngpConfig, ZipNerfConfig
 from visdom_plugin.methods.fields.shape_prior import ShapePrior
@@ -29,7 +30,7 @@ Config = TypeVar("Config", IngpConfig, ZipNerfConfig)
 log = logging.getLogger(__name__)
 
 
-class RadianceField(ABC, Generic[Config]):
+class RadianceField(CorrectsColours, ABC, Generic[Config]):
     """See `visdom_plugin.training.protocols.Method` for what each call does."""
 
     rays_at_once: ClassVar[int]
@@ -59,6 +60,9 @@ class RadianceField(ABC, Generic[Config]):
         self.prior: ShapePrior | None = None
         if self.config.prior_weight > 0 and hull is not None and hull.inner is not None:
             self.prior = ShapePrior(hull, self.frame)
+        if self.config.colour_correction:
+            self.correction = ColourCorrection(len(views), self.config.steps, device)
+            self._last_pixels = (views.cameras.width * views.cameras.height).cumsum(0).to(device)
         self.build(cameras, generator(seed, "field"))
         if device.type == "cpu":
             self._warm_up(views.cameras[0])
@@ -141,6 +145,13 @@ class RadianceField(ABC, Generic[Config]):
                 losses.append(hook.virtual_weight * mask_loss(alpha, torch.zeros_like(alpha)))
         return {"empty": sum(losses[1:], losses[0])} if losses else {}
 
+    def correct(self, rgb: Tensor, alpha: Tensor, background: Tensor, pixels: Tensor | None) -> Tensor:
+        """Colours (n, 3) of training pixels as their photographs' camera took them; see `ColourCorrection`."""
+        if self.correction is None or pixels is None:
+            return rgb
+        view = torch.searchsorted(self._last_pixels, pixels, right=True)
+        return self.correction.apply(rgb, alpha, background, view)
+
     def draw_background(self, n: int, generator: Generator) -> Tensor:
         """(n, 3) behind the photographs of a training step."""
         if self.config.background == "random":
@@ -148,10 +159,11 @@ class RadianceField(ABC, Generic[Config]):
         return torch.ones(n, 3, device=self.device)
 
     def state_dict(self) -> dict[str, Tensor]:
-        return self.optimiser.state_dict()
+        return self.optimiser.state_dict() | self.correction_state()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self.optimiser.load_state_dict(state)
+        self.load_correction(state)
 
     def _warm_up(self, camera: Cameras) -> None:
         """Compiles the CPU kernels of a step, or loads them, on 16 pixels; the gradients are dropped."""

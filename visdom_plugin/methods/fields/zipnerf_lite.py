@@ -137,6 +137,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         colours = self._shade(out[..., 1:], rays.directions[:, None])
         last = levels[-1]
         rgb, alpha, _ = composite(last.weights, colours, last.t, background)
+        rgb = self.correct(rgb, alpha, background, batch.pixels)
         target = photograph_on(background, batch, alpha)
         error = rgb - target
         losses = {"colour": (error.square() + CHARBONNIER**2).sqrt().mean()}
@@ -171,6 +172,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
                 step, c.steps, first=c.lr, last=c.lr_final, warm_up=c.lr_warm_up, delay=c.lr_delay
             )
         )
+        self.step_correction(step)
 
     def export(self, folder: Path) -> list[Path]:
         return export_mesh(Path(folder) / "mesh.ply", self.mesh())

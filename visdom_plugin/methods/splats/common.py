@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 from visdom_plugin.compute.transfer import send
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.losses import composite_target, mask_loss, photometric_loss
+from visdom_plugin.methods.colour_correction import ColourCorrection
 from visdom_plugin.render import Render
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.set_config import GaussianSetConfig
@@ -20,9 +21,16 @@ _TRANSPARENT = -20.0
 
 
 def fit_view(
-    render: Render, batch: ViewBatch, background: Tensor, config: GaussianSetConfig
+    render: Render,
+    batch: ViewBatch,
+    background: Tensor,
+    config: GaussianSetConfig,
+    correction: ColourCorrection | None = None,
 ) -> tuple[dict[str, Tensor], Tensor]:
     """How far the render of a training view is from its photograph on the same background.
+
+    Args:
+        correction: of the views' colours, where there is one.
 
     Returns:
         Weighted losses by name, and the PSNR in dB, a scalar without gradient.
@@ -31,9 +39,12 @@ def fit_view(
     target = composite_target(
         batch.image, batch.mask, background, alpha=render.alpha, mask_known=batch.mask_known
     )
-    errors = (render.rgb.detach() - target).square()
+    rgb = render.rgb
+    if correction is not None:
+        rgb = correction.apply(rgb, render.alpha, background, batch.index)
+    errors = (rgb.detach() - target).square()
     mse = errors.mean() if weight is None else (errors.mean(-1) * weight).sum() / weight.sum().clamp_min(1)
-    losses = {"photometric": photometric_loss(render.rgb, target, config.ssim_weight, weight)}
+    losses = {"photometric": photometric_loss(rgb, target, config.ssim_weight, weight)}
     if config.mask_weight and batch.mask_known:
         losses["mask"] = config.mask_weight * mask_loss(render.alpha, batch.mask, weight)
     return losses, -10 * mse.clamp_min(1e-10).log10()

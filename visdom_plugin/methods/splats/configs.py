@@ -29,6 +29,9 @@ class HullStartConfig(GaussianSetConfig):
     dropout: float = 0.0
     """Share of the Gaussians that a step leaves out at random, grown linearly to this value at the end; the others
     are the more opaque for it (Park et al., DropGaussian, CVPR 2025)."""
+    colour_correction: bool = False
+    """Fit an affine map of colours to each training view, for captures whose exposure or white balance changes;
+    novel views have the colours of the average one."""
     vd: RegularizerConfig = field(default_factory=RegularizerConfig)
     """The visible-domain hook; of two sets of Gaussians each has its loss."""
 

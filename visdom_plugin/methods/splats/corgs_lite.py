@@ -70,7 +70,9 @@ class CorgsLite(SplatMethod[CorgsConfig]):
             return self.splats.draw(camera, background, gaussians, degree)
 
         renders = [show(gaussians, batch.camera) for gaussians in sets]
-        (losses, psnr), (others, _) = (fit_view(render, batch, background, c) for render in renders)
+        (losses, psnr), (others, _) = (
+            fit_view(render, batch, background, c, self.correction) for render in renders
+        )
         losses = _numbered(losses, 0) | _numbered(others, 1)
         if c.pseudo_every and c.pseudo_from <= done <= c.pseudo_until and done % c.pseudo_every == 0:
             camera = self.pseudo_camera(step)
@@ -104,6 +106,7 @@ class CorgsLite(SplatMethod[CorgsConfig]):
             self._co_prune(done)
         for strategy in self.strategies:
             strategy.after_step(self.hooks, step)
+        self.step_correction(step)
 
     def _co_prune(self, done: int) -> None:
         first, second = (one.gaussians().means for one in self.sets)
@@ -119,12 +122,14 @@ class CorgsLite(SplatMethod[CorgsConfig]):
 
     def state_dict(self) -> dict[str, Tensor]:
         states = (strategy.state_dict() for strategy in self.strategies)
-        return {f"set{i}.{name}": value for i, state in enumerate(states) for name, value in state.items()}
+        own = {f"set{i}.{name}": value for i, state in enumerate(states) for name, value in state.items()}
+        return own | self.correction_state()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         for i, strategy in enumerate(self.strategies):
             prefix = f"set{i}."
             strategy.load_state_dict({k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)})
+        self.load_correction(state)
 
 
 def co_regularisation(first: Tensor, second: Tensor, ssim_weight: float, weight: float) -> dict[str, Tensor]:

@@ -51,7 +51,7 @@ class GsGo(SplatMethod[GsGoConfig]):
             return self.splats.draw(camera, background, gaussians, degree)
 
         render = show(batch.camera)
-        losses, psnr = fit_view(render, batch, background, c)
+        losses, psnr = fit_view(render, batch, background, c, self.correction)
         if c.depth_weight and batch.mono_depth is not None and batch.mask_known:
             object_mask = batch.mask if batch.weight is None else batch.mask * batch.weight
             depth = disparity_loss(render.depth, render.alpha, batch.mono_depth, object_mask)
@@ -68,9 +68,11 @@ class GsGo(SplatMethod[GsGoConfig]):
     def optimise(self, step: int, output: StepOutput) -> None:
         self.strategy.after_backward(step, output.renders[0])
         self.strategy.after_step(self.hooks, step)
+        self.step_correction(step)
 
     def state_dict(self) -> dict[str, Tensor]:
-        return self.strategy.state_dict()
+        return self.strategy.state_dict() | self.correction_state()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self.strategy.load_state_dict(state)
+        self.load_correction(state)

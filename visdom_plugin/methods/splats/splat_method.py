@@ -16,6 +16,7 @@ from visdom_plugin.geometry.cameras import Cameras, project
 from visdom_plugin.geometry.local_frame import mean_distance
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hull.hull import Hull
+from visdom_plugin.methods.colour_correction import ColourCorrection, CorrectsColours
 from visdom_plugin.methods.splats.common import scene_extent
 from visdom_plugin.methods.splats.configs import CorgsConfig, GsGoConfig
 from visdom_plugin.methods.splats.virtual_views import VirtualViews
@@ -35,7 +36,7 @@ SEEN_MARGIN = 0.5
 log = logging.getLogger(__name__)
 
 
-class SplatMethod(ABC, Generic[Config]):
+class SplatMethod(CorrectsColours, ABC, Generic[Config]):
     """See `visdom_plugin.training.protocols.Method` for what each call does."""
 
     fewest_views: ClassVar[int] = 1
@@ -66,6 +67,8 @@ class SplatMethod(ABC, Generic[Config]):
             log.info("loading the CPU kernels (compiled once per machine, which takes 10 to 30 s)")
             warm_up()
         self.unit = float(mean_distance(views.cameras.to("cpu", torch.float64))) or 1.0
+        if self.config.colour_correction:
+            self.correction = ColourCorrection(len(views), self.config.steps, device)
         self.virtual: VirtualViews | None = None
         if self.config.virtual_weight > 0 and hull is not None:
             self.virtual = VirtualViews(hull.inner or hull, views)
