@@ -53,7 +53,7 @@ def write_dataset(folder: Path, scene: Scene, hull: Hull | None, motion: Tensor 
             names.append(name)
             frames.append(part)
     points = _points(hull, scene.train, motion) if hull is not None else None
-    _write_transforms(folder, cameras, names, frames, points is not None)
+    write_transforms(folder, cameras, names, frames, points is not None)
     _write_colmap(folder / "sparse" / "0", cameras, names, points)
     made = [folder / name for name in ("images", "masks", "transforms.json", "sparse/0")]
     if hull is not None and points is not None:
@@ -79,9 +79,21 @@ def _points(hull: Hull, views: Views, motion: Tensor) -> tuple[np.ndarray, np.nd
     return moved.numpy(), (rgb * 255).round().byte().numpy()
 
 
-def _write_transforms(
-    folder: Path, cameras: list[Cameras], names: list[str], parts: list[str], points: bool
+def write_transforms(
+    folder: Path,
+    cameras: list[Cameras],
+    names: list[str],
+    parts: list[str] | None = None,
+    points: bool = False,
 ) -> None:
+    """Writes transforms.json of pictures in `folder/images`.
+
+    Args:
+        cameras: one per picture.
+        names: of the pictures, with their ending.
+        parts: "train" or "test" for each; None leaves the split to who reads it.
+        points: whether sparse_pc.ply lies beside.
+    """
     frames = []
     for camera, name in zip(cameras, names, strict=True):
         K = camera.intrinsics
@@ -101,8 +113,10 @@ def _write_transforms(
             }
         )
     content: dict[str, Any] = {"camera_model": "OPENCV", "frames": frames}
-    for part in ("train", "test"):
-        content[f"{part}_filenames"] = [f"images/{n}" for n, p in zip(names, parts, strict=True) if p == part]
+    for part in ("train", "test") if parts is not None else ():
+        content[f"{part}_filenames"] = [
+            f"images/{n}" for n, p in zip(names, parts or (), strict=True) if p == part
+        ]
     if points:
         content["ply_file_path"] = "sparse_pc.ply"
     write_json(folder / "transforms.json", content)

@@ -1,0 +1,74 @@
+"""From photographs with a board to a scene: poses, masks, files, and running it again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from datamodules import load
+from visdom_plugin.cli.commands.prepare import main
+from visdom_plugin.prepare.demo import true_mask
+
+
+def hashes(folder) -> dict[str, str]:
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def views_of(scene):
+    return load(scene, views=99, train_list="all", test=False).train
+
+
+def test_poses_are_the_true_ones_in_metres(photographs, prepared):
+    views = views_of(prepared)
+    assert [n.partition("/")[2] for n in views.names] == [
+        t.name.replace("jpg", "png") for t in photographs.truths
+    ]
+    for i, truth in enumerate(photographs.truths):
+        found = views.cameras.world_from_camera[i].numpy()
+        turn = found[:3, :3].T @ truth.world_from_camera[:3, :3]
+        angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+        away = np.linalg.norm(found[:3, 3] - truth.world_from_camera[:3, 3])
+        assert angle < 0.3 and away < 0.01 * np.linalg.norm(truth.world_from_camera[:3, 3]), truth.name
+        assert views.cameras.intrinsics[i, 0, 0] == pytest.approx(truth.focal_px, rel=0.01)
+        assert (views.images[i].shape[1], views.images[i].shape[0]) == truth.size
+
+
+def test_masks_are_near_the_true_ones(photographs, prepared):
+    views = views_of(prepared)
+    ious = []
+    for i, truth in enumerate(photographs.truths):
+        mask = views.masks[i].numpy()
+        true = true_mask(truth, (mask.shape[1], mask.shape[0]))
+        ious.append((mask & true).sum() / (mask | true).sum())
+    assert min(ious) > 0.7 and np.mean(ious) > 0.8, ious
+
+
+def test_the_record_says_what_was_done(photographs, prepared):
+    record = json.loads((prepared / "prepare.json").read_text())
+    assert record["poses"]["units"] == "metres" and record["left_out"] == {}
+    taken = hashes(photographs.folder)
+    assert record["asked"]["photographs"] == taken
+    assert {v["orientation"] for v in record["views"].values()} == {1, 6}
+    assert all(v["reprojection_px"] < 1 for v in record["views"].values())
+    written = hashes(prepared)
+    del written["prepare.json"]
+    assert record["written"] == written and "prepare.png" in written
+
+
+def test_again_changes_nothing(photographs, prepared, capsys):
+    before, taken = hashes(prepared), hashes(photographs.folder)
+    times = {p: p.stat().st_mtime_ns for p in prepared.rglob("*")}
+    assert main([str(photographs.folder), "--out", str(prepared)]) == 0
+    assert "nothing to do" in capsys.readouterr().out
+    assert hashes(prepared) == before and times == {p: p.stat().st_mtime_ns for p in prepared.rglob("*")}
+    assert hashes(photographs.folder) == taken and not list(prepared.parent.glob(".part-*"))
+
+
+def test_other_settings_are_refused_and_nothing_is_lost(photographs, prepared, capsys):
+    before = hashes(prepared)
+    assert main([str(photographs.folder), "--out", str(prepared), "--size", "400"]) == 2
+    assert "--overwrite" in capsys.readouterr().err and hashes(prepared) == before

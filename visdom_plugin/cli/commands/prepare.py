@@ -1,0 +1,139 @@
+"""visdom-prepare: from a folder of photographs to a scene with cameras and masks."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from visdom_plugin.cli.entry import run
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.prepare.settings import BoardSettings, MaskSettings, MaskWay, Volume
+
+if TYPE_CHECKING:
+    from visdom_plugin.prepare.run import Prepared
+
+
+@dataclass(frozen=True)
+class Options(BoardSettings):
+    """Make a scene of photographs: cameras, masks, pictures without lens distortion.
+
+    visdom-prepare --print-board board.pdf writes the board to print; lay it under the object, take 6 to 50
+    photographs with one lens, without zooming, and run visdom-prepare PHOTOS --out SCENE. PHOTOS is never touched.
+    """
+
+    photographs: tyro.conf.Positional[Path | None] = None
+    """Folder of the photographs."""
+    out: Path | None = None
+    """Folder to make the scene in; by default PHOTOS_scene."""
+    print_board: Path | None = None
+    """Write the board as PDF at true size, and nothing else."""
+    paper: Literal["a4", "letter", "a3", "tabloid"] = "a4"
+    """Paper to print the board on."""
+    focal_35mm: float | None = None
+    """Focal length as its 35 mm equivalent, where the files have no EXIF data and the views do not tell it."""
+    masks: str | None = None
+    """Folder of masks that you have; by default one of a usual name in PHOTOS, or alpha channels."""
+    mask_source: MaskWay = "auto"
+    """auto: masks that are there, else grabcut. given: only those. grabcut: from colours and the views' hull.
+    rembg: its networks. none: no masks."""
+    box: Volume | None = None
+    """The object lies in this box, in scene units (on a board: metres from its middle, z up)."""
+    height: float | None = None
+    """The object is not taller than this above the board, in metres; by default the board's long side."""
+    rounds: Annotated[int, tyro.conf.arg(name="mask-rounds")] = MaskSettings.rounds
+    """Rounds in which the hull of all views corrects each mask."""
+    rembg_models: str | None = None
+    """Folder that holds rembg's models (.onnx)."""
+    rembg_model: str = MaskSettings.model
+    """Name of rembg's model."""
+    size: int = 1600
+    """Longest side of the pictures written, in pixels; 0 for the photographs' own."""
+    overwrite: bool = False
+    """Make a scene anew that visdom-prepare made before."""
+    json: bool = False
+    """Print prepare.json in place of the summary."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return run(_main, argv)
+
+
+def _main(argv: Sequence[str]) -> None:
+    options = tyro.cli(Options, args=list(argv), prog="visdom-prepare")
+    board = BoardSettings(**{f.name: getattr(options, f.name) for f in fields(BoardSettings)})
+    if options.print_board is not None:
+        _print_board(options, board)
+        return
+    if options.photographs is None:
+        raise ConfigError(
+            "no folder of photographs is named",
+            todo="visdom-prepare PHOTOS --out SCENE, or visdom-prepare --print-board board.pdf",
+        )
+    from visdom_plugin.prepare.run import Plan, prepare
+
+    out = options.out or Path(f"{options.photographs.resolve().name}_scene")
+    masks = MaskSettings(
+        options.mask_source,
+        options.box,
+        options.height,
+        options.rounds,
+        options.rembg_models,
+        options.rembg_model,
+    )
+    plan = Plan(
+        options.photographs,
+        out,
+        options.size,
+        options.masks,
+        options.focal_35mm,
+        options.overwrite,
+        board,
+        masks,
+    )
+    made = prepare(plan)
+    if options.json:
+        sys.stdout.write(json.dumps(made.record) + "\n")
+    elif not options.quiet:
+        sys.stdout.write(_summary(made, out))
+
+
+def _print_board(options: Options, board: BoardSettings) -> None:
+    from visdom_plugin.prepare.board import print_board
+
+    assert options.print_board is not None
+    print_board(options.print_board, board, options.paper)
+    if not options.quiet:
+        sys.stdout.write(f"{options.print_board}: print it at 100 %, check the ruler, and lay it flat\n")
+
+
+def _summary(made: Prepared, out: Path) -> str:
+    record = made.record
+    poses, views, left = record["poses"], record["views"], record["left_out"]
+    lines = [
+        ("scene", str(out)),
+        ("photographs", f"{len(views)} of {len(views) + len(left)}, {poses['source']}"),
+    ]
+    if "focal_px" in poses:
+        lens = f"focal length {poses['focal_px']:.1f} px, k1 {poses['k1']:.4f}, k2 {poses['k2']:.4f}"
+        lines.append(("lens", f"{lens}; reprojection error {poses['reprojection_px']:.2f} px"))
+    ways = sorted({view["mask"] for view in views.values()})
+    lines.append(("masks", ", ".join(f"{sum(v['mask'] == w for v in views.values())} {w}" for w in ways)))
+    lines += [("left out", f"{name}: {why}") for name, why in left.items()]
+    lines += [("note", note) for note in made.notes]
+    if made.made:
+        lines.append(("next", f"look at {out / 'prepare.png'}, then: visdom-check {out}"))
+    width = max(len(name) for name, _ in lines)
+    return "".join(f"{name:<{width}}  {text}\n" for name, text in lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
