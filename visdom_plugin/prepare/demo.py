@@ -1,4 +1,4 @@
-"""Photographs of the built-in object on the printed board, as a phone would take them, and what is true of them."""
+"""Photographs of the built-in object on the printed board, as a phone would take them, and the truth of them."""
 
 from __future__ import annotations
 

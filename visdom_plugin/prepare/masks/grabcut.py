@@ -5,6 +5,8 @@ GrabCut works on a small copy; the outline is then drawn along the edges of the 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 BACKGROUND, OBJECT, LIKELY_BACKGROUND, LIKELY_OBJECT = range(4)
@@ -36,7 +38,8 @@ def cut(image: np.ndarray, labels: np.ndarray, rounds: int = 4) -> np.ndarray:
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     bgr = np.ascontiguousarray(image[..., ::-1])
-    cv2.grabCut(bgr, labels, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
+    whole: Any = None
+    cv2.grabCut(bgr, labels, whole, *models, rounds, cv2.GC_INIT_WITH_MASK)
     return np.isin(labels, (OBJECT, LIKELY_OBJECT))
 
 

@@ -1,8 +1,8 @@
 """The plane that the object stands on, seen without the object, and where each view differs from it.
 
 Every view is laid onto the plane z = 0; the median over the views shows the plane itself, board, table and
-shadows, because the object hides another part of it in each view. A pixel that differs from the plane there shows something
-else: the object, or what stands about.
+shadows, because the object hides another part of it in each view. A pixel that differs from the plane there shows
+something else: the object, or what stands about.
 """
 
 from __future__ import annotations
