@@ -134,6 +134,8 @@ class Common(FolderOptions):
     """Show the training in the browser, from its first checkpoint to its end; visdom-view shows it afterwards."""
     report: bool = True
     """End with report.html in the run directory, one page that shows what came out."""
+    tensorboard: Path | None = None
+    """Folder for TensorBoard's files, one per run, with numbers and pictures; needs the extra tensorboard."""
     show_config: bool = False
     """Print all settings as YAML and exit."""
 

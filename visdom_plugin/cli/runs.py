@@ -17,7 +17,12 @@ if TYPE_CHECKING:
 
 
 def train_as_asked(
-    request: options.Request, scene, run_dir: Path, device: str, on_finished: OnFinished | None = None
+    request: options.Request,
+    scene,
+    run_dir: Path,
+    device: str,
+    on_finished: OnFinished | None = None,
+    tensorboard: Path | None = None,
 ) -> dict[str, Any]:
     """`training.run.train` with what the command line says; run.json's content."""
     from visdom_plugin.training.run import train
@@ -37,6 +42,7 @@ def train_as_asked(
         budget=common.budget,
         request=options.describe_reading(common),
         on_finished=on_finished,
+        tensorboard=tensorboard,
     )
 
 

@@ -62,6 +62,13 @@ class Progress:
         if self._bar is not None:
             self._bar.stop()
 
+    def say(self, text: str) -> None:
+        """A line above the bar, or between two lines of progress."""
+        if self._bar is not None:
+            self._bar.console.print(text, highlight=False, markup=False, soft_wrap=True)
+        elif not self.quiet:
+            print(text, file=self.stream, flush=True)
+
     def show(
         self,
         done: int,

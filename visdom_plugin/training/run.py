@@ -21,6 +21,7 @@ from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import Scene, Views
 from visdom_plugin.specs import Settings
 from visdom_plugin.training.evaluate import carve_reference, evaluate
+from visdom_plugin.training.live import SHEET, Live, LivePictures, TensorBoard
 from visdom_plugin.training.local_method import LocalMethod, move_near
 from visdom_plugin.training.progress import Progress
 from visdom_plugin.training.protocols import Batch, Hook, Method
@@ -71,6 +72,7 @@ def train(
     request: Record | None = None,
     budget: str | None = None,
     on_finished: OnFinished | None = None,
+    tensorboard: Path | None = None,
 ) -> Record:
     """Trains, evaluates and writes the run directory; resumes the same run where it was left.
 
@@ -80,6 +82,7 @@ def train(
         preset_name: names the method's class; its settings are `config`.
         request: how the scene was asked for, so that it can be loaded again: path, seed, views, downscale.
         budget: noted in run.json.
+        tensorboard: folder for TensorBoard's files, with numbers and pictures.
         on_finished: called at the end of a run that this call finishes; what it raises is logged, no
             more.
 
@@ -91,7 +94,9 @@ def train(
         EmptyHullError: when the config's hull is empty.
         TrainingError: when the optimisation diverges.
         Interrupted: after Ctrl-C or SIGTERM; the same call resumes it.
+        PluginError: TensorBoard's files are asked for, and the package is not installed.
     """
+    board = None if tensorboard is None else TensorBoard(tensorboard)
     preset = registry.find(preset_name)
     device = torch.device(device)
     if preset.hook == "gaussian" and getattr(config, "hull", None) is None:
@@ -116,7 +121,7 @@ def train(
         run.update(status="running", budget=budget, **circumstances)
         try:
             resumed, method, hull = _run(
-                preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds
+                preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds, board
             )
         except KeyboardInterrupt:
             run.update(status="interrupted")
@@ -128,6 +133,9 @@ def train(
         except BaseException as error:
             run.update(status="failed", error=f"{type(error).__name__}: {error}")
             raise
+        finally:
+            if board is not None:
+                board.close()
         if on_finished is not None:
             try:
                 on_finished(run.record, method, hull)
@@ -146,6 +154,7 @@ def _run(
     seed: int,
     quiet: bool,
     checkpoint_seconds: float,
+    board: TensorBoard | None,
 ) -> tuple[int | None, Method, Hull | None]:
     """Where it went on from, and what was trained."""
     saved = run.path / "hull"
@@ -156,6 +165,10 @@ def _run(
         hull_s = run.record.get("timing", {}).get("hull_s", hull_s)
         run.update(timing={"hull_s": hull_s})
     batches = data_manager(move_near(scene.train), seed, device)
+    pictures = None
+    if board is not None or not quiet:
+        keep = {} if board is None else {"keep": board.picture}
+        pictures = LivePictures(method, scene.train, device, run.path / SHEET, **keep)
     trainer = Trainer(
         method,
         choose_batches(method, batches),
@@ -164,6 +177,7 @@ def _run(
         quiet=quiet,
         checkpoint_seconds=checkpoint_seconds,
         train_psnr=view_psnr(method, scene.train, device),
+        watch=Live(pictures, board),
     )
     if not trainer.run():
         raise Interrupted
@@ -172,6 +186,8 @@ def _run(
     refuse_empty(method, scene.train, device, run.path)
     found = assess(method, config, hull, scene, device=device, run_dir=run.path, quiet=quiet)
     eval_s = time.monotonic() - began
+    if board is not None:
+        board.scalars("test", found["test"], trainer.step)
     step_ms = 1000 * trainer.train_s / max(trainer.step, 1)
     run.record.pop("error", None)
     run.update(

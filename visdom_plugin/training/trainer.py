@@ -18,7 +18,7 @@ from visdom_plugin.training import metrics
 from visdom_plugin.training.progress import Progress
 from visdom_plugin.training.protocols import Batch, Method, StepOutput
 from visdom_plugin.training.runs import checkpoints
-from visdom_plugin.training.runs.run_directory import RunDir
+from visdom_plugin.training.runs.run_directory import Record, RunDir
 
 LOGGED = 100
 """Lines in log.jsonl over the whole schedule."""
@@ -47,6 +47,7 @@ class Trainer:
         quiet: bool = False,
         checkpoint_seconds: float = 30,
         train_psnr: Callable[[int], float] | None = None,
+        watch: Callable[[Record], str | None] = lambda _: None,
     ):
         """
         Args:
@@ -55,10 +56,11 @@ class Trainer:
             checkpoint_seconds: time between two checkpoints; one is always taken at the end.
             train_psnr: PSNR of a training view for the progress line, a function of the step; used where the
                 method's steps give no metric "psnr" of their own.
+            watch: is handed each line of the log; what it returns is said beside the progress.
         """
         self.method, self.batch_of, self.run_dir = method, batch_of, run
         self.device, self.quiet, self.checkpoint_seconds = device, quiet, checkpoint_seconds
-        self.train_psnr = train_psnr
+        self.train_psnr, self.watch = train_psnr, watch
         self.folder = run.path / "checkpoints"
         self.step, self.train_s = 0, 0.0
         self.stopped = False
@@ -99,11 +101,14 @@ class Trainer:
                     row = {"step": self.step, "loss": loss}
                     row |= {f"loss_{k}": float(v.detach()) for k, v in output.losses.items()}
                     row |= summarise(self.method)
-                    self.run_dir.log(row | {"psnr": psnr, "train_s": round(self.train_s, 3)})
+                    row |= {"psnr": psnr, "train_s": round(self.train_s, 3)}
+                    self.run_dir.log(row)
                 if save:
                     self._save()
                     saved = time.monotonic()
                 progress.show(self.step, loss, psnr, summarise(self.method))
+                if due and (said := self.watch(row)) is not None:
+                    progress.say(said)
         if self.stopped and self.step < total:
             self._save()
             return False

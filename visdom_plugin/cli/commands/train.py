@@ -50,7 +50,7 @@ def _train(argv: Sequence[str]) -> None:
 
         on_finished = partial(report_finished, scene=scene, run_dir=folder, device=device, check=find_briefly)
     with watching(folder) if common.view else nullcontext():
-        record = train_as_asked(request, scene, folder, device, on_finished)
+        record = train_as_asked(request, scene, folder, device, on_finished, common.tensorboard)
     if not common.quiet:
         if record["already_finished"]:
             say("this run is finished already; nothing was done (train again with --overwrite)")
