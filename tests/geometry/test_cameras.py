@@ -208,9 +208,10 @@ K = np.array([[110.0, 0, 52.5], [0, 115.0, 37.0], [0, 0, 1]])
         (np.diag([1 / 100, 1 / 80, 1]) @ K, "fractions(.|\n)*first row by the width"),
         (
             np.array([[110, 0, 0.525], [0, 115, 0.46], [0, 0, 1]]),
-            "centre left at 0(.|\n)*cx about width",
+            "fractions(.|\n)*cx by the width",
         ),
-        (np.diag([110, 115, 1]), "left at 0"),
+        (np.diag([110, 115, 1]), "left at 0(.|\n)*cx about width"),
+        (np.array([[60, 0, 0.5], [0, 60, 0.5], [0, 0, 1]]), "fractions(.|\n)*60 is an angle in degrees"),
         (np.array([[0.85, 0, 50], [0, 0.68, 40], [0, 0, 1]]), "an angle"),
     ],
 )

@@ -268,13 +268,16 @@ def _check_units(cameras: Cameras) -> None:
     if not bad.any():
         return
     fx, fy, cx, cy, w, h = torch.cat([focal, centre, size], -1)[bad].reshape(-1, 6)[0].tolist()
-    cause, todo = "an angle or millimetres as focal length", "pass fx = width / (2 tan(angle / 2)), fy alike"
+    cause = "an angle, a fraction of the image or millimetres as focal length"
+    todo = "pass fx = width / (2 tan(angle / 2)), fy alike"
     if cornered[bad].any():
-        cause, todo = (
-            "fractions of the image, or a centre left at 0",
-            "pass cx about width / 2, cy about height / 2",
-        )
-        todo = "multiply K's first row by the width, its second by the height" if min(fx, fy) < 4 else todo
+        cause, todo = "fractions of the image", "multiply cx by the width, cy by the height"
+        if cx == cy == 0:
+            cause, todo = "a centre left at 0", "pass cx about width / 2, cy about height / 2"
+        if min(fx, fy) < 4:
+            todo = "multiply K's first row by the width, its second by the height"
+        elif fx <= min(180, w):
+            todo += f"; and where {fx:.4g} is an angle in degrees, fx = width / (2 tan(angle / 2)), fy alike"
     values = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} for an image of {w:g} x {h:g}"
     raise SceneError(f"K of {_which(bad)} is not in pixels: {values}", cause=cause, todo=todo)
 

@@ -64,13 +64,15 @@ class VisibleDomain(HullSettings):
         Raises:
             EmptyHullError: when nothing is left, with the cause where it could be established.
             SceneError: when masks and cameras do not fit each other: in number or size; because all cameras stand
-                at one point; or, with automatic bounds, because the hull covers little of the masks, or is
-                degenerate, and would be sound with poses of another convention.
+                at one point; because focal lengths in another unit explain the masks; or, with automatic bounds,
+                because the hull covers little of the masks, or is degenerate, and would be sound with poses of
+                another convention.
         """
         # Settings stand on every command line: torch and numba are loaded when a hull is carved, the check, which
         # needs OpenCV, when it is asked.
         from visdom_plugin.hull.carving.carve import carve_silhouettes
         from visdom_plugin.hull.carving.votes import gather_silhouettes
+        from visdom_plugin.hull.checks.causes.intrinsics import may_be_other_units
         from visdom_plugin.hull.checks.coverage import looks_sound
         from visdom_plugin.hull.checks.degenerate import stand_at_one_point
         from visdom_plugin.hull.checks.mask_checks import look_inverted
@@ -81,6 +83,10 @@ class VisibleDomain(HullSettings):
             from visdom_plugin.hull.checks.explain_failure import explain_one_point
 
             raise explain_one_point(self, cameras, silhouettes)
+        if may_be_other_units(cameras):
+            from visdom_plugin.hull.checks.explain_failure import refuse_other_unit
+
+            refuse_other_unit(cameras, silhouettes)
         settings = self
         if self.k == "auto" and self.kind != "released-go":
             from visdom_plugin.hull.checks.covisibility import advise_k

@@ -10,8 +10,8 @@ from tests.datamodules.layouts import layout_writers as w
 from tests.hull.checks.faults import capture_of
 from visdom_plugin.cli.commands.check import carving_views, check_views
 from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.hull.checks.causes.pose_conventions import PoseFaults, pose_faults
 from visdom_plugin.hull.checks.check import check
-from visdom_plugin.hull.checks.pose_conventions import PoseFaults, pose_faults
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 IN_FILE = {

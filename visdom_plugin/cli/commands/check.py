@@ -143,8 +143,8 @@ def check_views(
     views: Views, masks: Sequence, *, k: int | None = None, brief: bool = False, layout: str | None = None
 ) -> Check:
     """`hull.check.check` of a scene's views; `layout` is that of a scene on disk."""
+    from visdom_plugin.hull.checks.causes.pose_conventions import pose_faults
     from visdom_plugin.hull.checks.check import check
-    from visdom_plugin.hull.checks.pose_conventions import pose_faults
 
     images = () if brief else views.images
     poses = pose_faults(layout)

@@ -12,6 +12,9 @@ from torch import Tensor
 
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hull.carving.votes import gather_silhouettes
+from visdom_plugin.hull.checks.causes.fault_hypotheses import QUIET_PX, Suspicion, find_causes
+from visdom_plugin.hull.checks.causes.intrinsics import find_astray, find_other_unit
+from visdom_plugin.hull.checks.causes.pose_conventions import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.checks.covisibility import (
     LEAST_K,
     LOST,
@@ -22,7 +25,6 @@ from visdom_plugin.hull.checks.covisibility import (
 )
 from visdom_plugin.hull.checks.degenerate import stand_at_one_point
 from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines, draw_outlines, turn_over
-from visdom_plugin.hull.checks.fault_hypotheses import QUIET_PX, Suspicion, find_causes
 from visdom_plugin.hull.checks.findings import Finding, Name, Sure
 from visdom_plugin.hull.checks.mask_checks import (
     check_border,
@@ -31,7 +33,6 @@ from visdom_plugin.hull.checks.mask_checks import (
     find_repeated,
     look_inverted,
 )
-from visdom_plugin.hull.checks.pose_conventions import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.checks.silhouette_consistency import Coherence, measure_coherence
 from visdom_plugin.hull.foreign import to_numpy
 from visdom_plugin.hull.wording import wording
@@ -39,8 +40,6 @@ from visdom_plugin.hull.wording import wording
 CLUSTERED_DEGREES = 60.0
 """Views within this angle leave a hull more than 1.7 times as deep as the object."""
 _DISAGREE_PX, _SPEAKING_PX = 0.1, 0.5
-_MIDDLE = 0.25
-"""Principal points further than this from the images' centres, in image sizes, are outside their middle half."""
 _DEAR = 0.2
 """Share of a mask that no other view shows: up to here a note, beyond it a finding."""
 _RAYS, _BRIEF_VIEWS = 1024, 16
@@ -118,11 +117,13 @@ def check(
     turned = {v for f in inverted for v in f.views}
     turned_over = [_without(~m, unknown[i]) if i in turned else m for i, m in enumerate(own)]
     found += check_border(turned_over, names)
+    units, outlines = find_other_unit(chosen, outlines)
+    found += units
     causes, fit, left = find_causes(outlines, brief=brief, poses=poses)
     if stand_at_one_point(chosen) and not any(c.kind == "axes" for c in causes):
         notes, found = _split([*found, *repeated, _one_point(len(chosen))])
         return Check(found, notes, None, fit, tuple(usable.tolist()))
-    astray = _astray(chosen)
+    astray = find_astray(chosen)
     if astray and _views_alone(causes, fit):
         notes, found = _split([*found, *repeated, astray])
         return Check(found, notes, None, fit, tuple(usable.tolist()))
@@ -239,29 +240,6 @@ def _one_point(count: int) -> Finding:
         float(count),
         "give each pose its camera's position; on a turntable, world-to-camera matrices taken for their inverses "
         "look like this: invert them",
-    )
-
-
-def _astray(cameras: Cameras) -> Finding | None:
-    """Principal points outside the middle half of most images."""
-    K = cameras.intrinsics.double().cpu().numpy()
-    points = K[:, :2, 2]
-    shares = points / torch.stack([cameras.width, cameras.height], -1).cpu().numpy()
-    out = np.abs(shares - 0.5).max(1) > _MIDDLE
-    if 2 * out.sum() <= len(out):
-        return None
-    (x, y), (across, down) = np.median(points, 0), np.median(shares, 0)
-    normalised = bool((points <= 1).all(1).mean() > 0.5)
-    return Finding(
-        "principal",
-        f"the principal points (cx, cy) lie at ({x:.4g}, {y:.4g}) pixels, {across:.0%} of the images' width and "
-        f"{down:.0%} of their height, and the views do not fit together",
-        (),
-        "certain" if normalised else "likely",
-        float(out.mean()),
-        "multiply cx by the width and cy by the height: they are normalised"
-        if normalised
-        else "give cx and cy in pixels from the image's upper left corner, and scale them with the images",
     )
 
 

@@ -17,10 +17,12 @@ from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.carve import carve_silhouettes
 from visdom_plugin.hull.carving.keep_rule import KeepRule
 from visdom_plugin.hull.carving.votes import Silhouettes
+from visdom_plugin.hull.checks.causes.intrinsics import describe_suspicion, find_other_unit
 from visdom_plugin.hull.checks.check import check
 from visdom_plugin.hull.checks.coverage import POOR_COVERAGE, measure_coverage
 from visdom_plugin.hull.checks.covisibility import LEAST_K, USUAL_K
 from visdom_plugin.hull.checks.degenerate import count_cameras_inside, describe_speck
+from visdom_plugin.hull.checks.distance_fields import draw_outlines
 from visdom_plugin.hull.checks.findings import Finding, Name
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.settings import HullSettings
@@ -85,6 +87,16 @@ def explain_one_point(settings: HullSettings, cameras: Cameras, silhouettes: Sil
     what = f"all {len(cameras)} cameras stand at one point, from which nothing can be told of depth"
     cause = None if fault.kind == "centres" else _cause(fault)
     return SceneError(what, where=_where(fault), cause=cause, todo=_todo(fault))
+
+
+def refuse_other_unit(cameras: Cameras, silhouettes: Silhouettes) -> None:
+    """Raises SceneError where focal lengths in another unit than pixels explain the masks; where the masks do not
+    decide, a warning tells of those that are odd."""
+    found, _ = find_other_unit(cameras, draw_outlines(cameras, silhouettes))
+    if found:
+        raise SceneError(_cause(found[0]), where="camera intrinsics", todo=found[0].todo)
+    if odd := describe_suspicion(cameras):
+        log.warning("camera intrinsics: %s", odd)
 
 
 def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouettes, hull: Hull) -> str | None:

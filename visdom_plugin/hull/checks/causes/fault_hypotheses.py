@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from visdom_plugin.hull.checks.causes.pose_conventions import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.checks.distance_fields import Outlines
-from visdom_plugin.hull.checks.pose_conventions import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.checks.silhouette_consistency import Coherence, measure_coherence
 
 QUIET_PX = 0.015
