@@ -1,5 +1,7 @@
 """Losses by their definitions."""
 
+import math
+
 import pytest
 import torch
 
@@ -67,6 +69,19 @@ def test_inside_the_mask_the_gradient_ends_at_the_bounds():
     alpha = torch.tensor([0.0, 1e-7, 0.5, 1.0], requires_grad=True)
     mask_loss(alpha, torch.ones(4)).backward()
     assert alpha.grad.tolist() == [0, 0, -0.5, 0]
+
+
+def test_a_wider_clamp_asks_for_less_and_stops_pulling_there():
+    alpha = torch.tensor([0.0005, 0.3, 0.9, 0.9999], requires_grad=True)
+    mask = torch.tensor([0.0, 0.0, 1.0, 1.0])
+    loss = mask_loss(alpha, mask, clamp=0.001)
+    expected = 0.0
+    for a, m in zip(alpha.tolist(), mask.tolist(), strict=True):
+        a, m = (min(max(x, 0.001), 0.999) for x in (a, m))
+        expected -= m * math.log(a) + (1 - m) * math.log(1 - a)
+    assert loss.item() == pytest.approx(expected / 4, rel=1e-5)
+    loss.backward()
+    assert alpha.grad[0] == alpha.grad[3] == 0 and alpha.grad[1] > 0 > alpha.grad[2]
 
 
 def test_disparity_loss_ignores_scale_and_shift_of_disparity():

@@ -252,6 +252,30 @@ def test_variants_may_change_more_and_full_keeps_its_own():
     assert presets["mine+vd"].full.steps == 900 and presets["my+vd"] is presets["mine+vd"]
 
 
+def test_a_recipe_is_all_that_its_variant_is_and_its_own_changes():
+    spec = replace(
+        SPEC,
+        variants={"vd": {"steps": 50}, "vd:theirs": {"width": 5}, "mask:heavy": {"mask_weight": 2.0}},
+        quick_variants={"vd": {"width": 4}, "vd:theirs": {"steps": 8}},
+        descriptions={"vd:theirs": "as they run it"},
+    )
+    presets = spec.presets()
+    assert [n for n in presets if n.startswith("mine")] == [
+        "mine", "mine+mask", "mine+vd", "mine+vd:theirs", "mine+mask:heavy"
+    ]  # fmt: skip
+    vd, theirs = presets["mine+vd"], presets["mine+vd:theirs"]
+    assert theirs.full == replace(vd.full, width=5) and theirs.quick == replace(vd.quick, width=5, steps=8)
+    assert theirs.hook == "sampler" and theirs.description == "as they run it"
+    assert (
+        presets["mine+mask:heavy"].quick.mask_weight == 2.0
+        and not presets["mine+mask:heavy"].quick.vd.enabled
+    )
+    assert presets["mine+mask:heavy"].description == "mine, with the silhouette loss, heavy"
+    registry = Registry()
+    registry.add(spec, "somewhere")
+    assert registry.find("my+vd:theirs") is registry.find("mine+vd:theirs")
+
+
 @pytest.mark.parametrize(
     ("changes", "what"),
     [
@@ -269,6 +293,9 @@ def test_variants_may_change_more_and_full_keeps_its_own():
         ({"quick_variants": {"vd": {"widht": 3}}}, "sets 'widht'"),
         ({"hook": "samplr"}, "no hook 'samplr'"),
         ({"variants": {"+vd": {}}}, "no variant '+vd'"),
+        ({"variants": {"vd:": {}}}, "no variant 'vd:'"),
+        ({"variants": {"bare:mine": {}}}, "no variant 'bare:mine'"),
+        ({"variants": {"vd:mine": {"widht": 3}}}, "sets 'widht'"),
         ({"variants": {"vd": {"widht": 3}}}, "sets 'widht'"),
         ({"hook": None, "variants": {"vd": {}}}, "no variant 'vd'"),
     ],

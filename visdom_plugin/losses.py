@@ -70,14 +70,18 @@ def below_one(alpha: Tensor) -> Tensor:
     return alpha - (alpha.detach() - OPAQUE).clamp_min(0)
 
 
-def mask_loss(alpha: Tensor, mask: Tensor, weight: Tensor | None = None) -> Tensor:
+def mask_loss(alpha: Tensor, mask: Tensor, weight: Tensor | None = None, clamp: float = 1e-6) -> Tensor:
     """Mean binary cross entropy between rendered opacity and the foreground mask.
 
     Args:
         alpha: (H, W) in [0, 1].
         mask: (H, W) float, 1 on the object.
         weight: (H, W) float, 0 at pixels that take no part and 1 elsewhere, or None when all do.
+        clamp: opacity and mask count as at least this far from 0 and 1, below 0.5. Above the default a mask of 0
+            or 1 thus asks for `clamp` or 1 - `clamp`, and beyond it there is no gradient.
     """
+    if clamp > 1e-6:
+        alpha, mask = (x.clamp(clamp, 1 - clamp) for x in (alpha, mask))
     # Inside the mask nothing is gained beyond the upper bound. The lower one stops an unbounded gradient.
     alpha = torch.where(mask < 1, below_one(alpha), alpha.clamp_max(OPAQUE)).clamp_min(1e-6)
     if weight is None:

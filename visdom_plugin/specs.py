@@ -139,7 +139,8 @@ class MethodSpec:
     """One line for lists and help."""
     variants: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     """What a variant changes besides, by "mask" or "vd" and the config's field. A method without a hook has no
-    other variants than those named here."""
+    other variants than those named here. "vd:NAME" is a variant of its own, `name+vd:NAME`: all that "vd" is, and
+    these changes."""
     quick_variants: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     """The same for the quick settings alone."""
     descriptions: Mapping[str, str] = field(default_factory=dict)
@@ -187,11 +188,14 @@ class MethodSpec:
             )
             demand(fits, f"the config's field vd is {type(vd).__name__}", f"use {HOOKS[self.hook].__name__}")
         for suffix, changes in (*self.variants.items(), *self.quick_variants.items()):
-            fine = isinstance(suffix, str) and re.fullmatch(r"[A-Za-z0-9][\w.-]*", suffix)
+            fine = isinstance(suffix, str) and re.fullmatch(
+                r"[A-Za-z0-9][\w.-]*(:[A-Za-z0-9][\w.-]*)?", suffix
+            )
             demand(
-                bool(fine) and (suffix in MADE) == (self.hook is not None),
+                bool(fine) and (suffix.partition(":")[0] in MADE) == (self.hook is not None),
                 f"there is no variant {suffix!r}",
-                'variants are "mask" and "vd" of a method with a hook, and any others of one without',
+                'variants are "mask" and "vd" of a method with a hook, and "mask:NAME" and "vd:NAME" that start '
+                "from these; and any others of one without",
             )
             for name in changes:
                 demand(name in names, f"variant {suffix!r} sets {name!r}, which the config lacks", "add it")
@@ -199,27 +203,33 @@ class MethodSpec:
     def presets(self) -> dict[str, Preset]:
         """The variants by name, and by alias."""
         made: dict[str, Preset] = {}
-        for suffix in ("", *(self.variants if self.hook is None else MADE)):
+        for suffix in dict.fromkeys(("", *(() if self.hook is None else MADE), *self.variants)):
             name = f"{self.name}+{suffix}" if suffix else self.name
             text = self.description
             if suffix:
-                made_up = f"{text or self.name}, {MADE.get(suffix, suffix)}"
+                base, _, recipe = suffix.partition(":")
+                made_up = f"{text or self.name}, {MADE.get(base, base)}" + (f", {recipe}" if recipe else "")
                 text = self.descriptions.get(suffix, made_up)
-            quick = replace(self._vary(self.quick, suffix), **self.quick_variants.get(suffix, {}))
-            standard = None if self.standard is None else self._vary(self.standard, suffix)
-            full = self._vary(self.full, suffix)
+            quick = self._vary(self.quick, suffix, self.variants, self.quick_variants)
+            standard = None if self.standard is None else self._vary(self.standard, suffix, self.variants)
+            full = self._vary(self.full, suffix, self.variants)
             made[name] = Preset(name, text, self.target, quick, full, self.hook, standard)
         for alias in self.aliases:
             made |= {name.replace(self.name, alias, 1): p for name, p in list(made.items()) if name == p.name}
         return made
 
-    def _vary(self, config: Settings, suffix: str) -> Settings:
+    def _vary(self, config: Settings, suffix: str, *varied: Mapping[str, Mapping[str, Any]]) -> Settings:
+        """The settings of a variant; "vd:NAME" is what "vd" is and then its own changes, by each of `varied`."""
         changes: dict[str, object] = {}
-        if suffix in MADE:
+        base, recipe, _ = suffix.partition(":")
+        if base in MADE:
             changes["mask_weight"] = MASK_WEIGHT
-        if suffix == "vd":
+        if base == "vd":
             changes["hull"] = TRAINING_DOMAIN
             vd = getattr(config, "vd", None)
-            base: Any = vd if is_dataclass(vd) else HOOKS[self.hook or ""]()
-            changes["vd"] = replace(base, enabled=True)
-        return replace(config, **changes | dict(self.variants.get(suffix, {})))
+            hook: Any = vd if is_dataclass(vd) else HOOKS[self.hook or ""]()
+            changes["vd"] = replace(hook, enabled=True)
+        for part in (base, suffix) if recipe else (base,):
+            for variants in varied:
+                changes |= variants.get(part, {})
+        return replace(config, **changes)

@@ -15,7 +15,9 @@ from visdom_plugin.hooks.configs import RegularizerConfig
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hooks.regularizer import outside_loss
 from visdom_plugin.hooks.settings import RegularizerSettings
+from visdom_plugin.hooks.virtual_views import midpoint_views
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
+from visdom_plugin.scene import Views
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.rasterise import rasterise
 
@@ -96,13 +98,78 @@ def test_views_of_the_bank_are_the_same_in_every_process(ball):
     first, second = (VisDomGaussianRegularizer(hull, cameras, bank=5) for _ in range(2))
     seen = set()
     for seed in range(40):
-        views = [hook._draw(torch.Generator().manual_seed(seed)) for hook in (first, second)]
+        views = [hook._draw(None, 0, torch.Generator().manual_seed(seed)) for hook in (first, second)]
         assert torch.equal(views[0][0].world_from_camera, views[1][0].world_from_camera)
         assert torch.equal(views[0][1], depth_and_silhouette(hull, views[1][0])[1])
         seen.add(tuple(views[0][0].centres.tolist()))
     assert len(seen) == 5
     fresh = VisDomGaussianRegularizer(hull, cameras, bank=0)
-    assert len({tuple(fresh._draw(None)[0].centres.tolist()) for _ in range(8)}) == 8
+    assert len({tuple(fresh._draw(None, 0, None)[0].centres.tolist()) for _ in range(8)}) == 8
+
+
+def test_midpoint_views_all_have_their_turn_before_any_has_another(ball):
+    cameras, hull = ball
+    hook = VisDomGaussianRegularizer(hull, cameras, views="midpoints", every=2, start=6, weight=1.0)
+    views = midpoint_views(cameras)
+    seen = []
+
+    def render(camera):
+        (number,) = (
+            i for i, v in enumerate(views) if torch.equal(v.world_from_camera, camera.world_from_camera)
+        )
+        seen.append(number)
+        return torch.full((SIZE, SIZE), 0.5, requires_grad=True)
+
+    for step in range(6, 6 + 4 * len(views), 2):
+        hook.loss(render, step)
+    first, second = seen[: len(views)], seen[len(views) :]
+    assert sorted(first) == sorted(second) == list(range(len(views))) and first != second
+    seen.clear()
+    hook = VisDomGaussianRegularizer(hull, cameras, views="midpoints", weight=1.0)
+    for _ in range(40):
+        hook.loss(render, generator=torch.Generator().manual_seed(len(seen)))
+    assert set(seen) == set(range(len(views)))
+
+
+def test_the_loss_may_go_by_a_hull_of_its_own(ball):
+    cameras, hull = ball
+    other = VisibleDomain(k=3, resolution=32, dilate_px=5).carve(cameras, capture()[1])
+    hook = VisDomGaussianRegularizer(hull, cameras, views="midpoints", weight=1.0, loss_hull=other)
+    assert hook.hull is hull
+
+    def render(camera):
+        seen.append(camera)
+        return torch.full((SIZE, SIZE), 0.5, requires_grad=True)
+
+    seen = []
+    loss = hook.loss(render, 0)["visdom_outside"]
+    masks = [depth_and_silhouette(h, seen[0])[1] for h in (other, hull)]
+    assert masks[0].sum() > masks[1].sum()
+    torch.testing.assert_close(loss.detach(), outside_loss(torch.full((SIZE, SIZE), 0.5), masks[0]))
+    with pytest.raises(ConfigError, match="no training camera sees"):
+        VisDomGaussianRegularizer(hull, cameras, loss_hull=other.relative_to(np.array([0, 0, 500.0])))
+
+
+def test_settings_carve_the_hull_of_the_loss(ball):
+    cameras, hull = ball
+    masks = capture()[1]
+    views = Views(cameras, [m[..., None].expand(-1, -1, 3).byte() for m in masks], masks, list("abcde"))
+    assert RegularizerConfig().build(hull, views).loss_hull is hull
+    domain = VisibleDomain(k=4, resolution=40)
+    assert RegularizerConfig(loss_hull=domain).build(hull, views).loss_hull == domain.carve(cameras, masks)
+
+
+def test_points_of_voxels_are_their_middles(ball):
+    cameras, hull = ball
+    hook = VisDomGaussianRegularizer(hull, cameras, points="voxels")
+    xyz, rgb = hook.initial_points(10 * hull.voxels)
+    assert len(xyz) == len(rgb) == hull.voxels
+    index = (xyz.numpy() - hull.bounds[0]) / hull.voxel_edges - 0.5
+    np.testing.assert_allclose(index, index.round(), atol=1e-3)
+    assert hull.occupancy[tuple(index.round().astype(int).T)].all()
+    some = hook.initial_points(500, torch.Generator().manual_seed(0))[0]
+    assert len(some) == 500 == len(some.unique(dim=0)) and torch.cdist(some, xyz).min(-1).values.max() < 1e-3
+    assert some.std(0).min() > 0.8 * xyz.std(0).min()
 
 
 def test_initial_points_lie_in_the_hull_and_take_the_photographs_colour(ball):
@@ -253,6 +320,7 @@ def test_bad_settings_are_refused(ball):
         {"weight": float("nan")},
         {"every": 0},
         {"points": "somewhere"},
+        {"views": "beside"},
         {"prune_every": -5},
         {"prune_margin_voxels": -1},
         {"prune_margin_voxels": float("nan")},

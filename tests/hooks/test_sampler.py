@@ -146,6 +146,24 @@ def test_the_unit_of_epsilon_is_what_its_name_says(hull):
     assert SamplerConfig(epsilon_hull_radii=2.0).build(hull, views).epsilon_world == pytest.approx(
         2 * hull.radius
     )
+    centres = cameras.centres
+    spread = max(float((c - centres.mean(0)).norm()) for c in centres)
+    assert SamplerConfig(epsilon_capture_radii=0.2).build(hull, views).epsilon_world == pytest.approx(
+        0.2 * spread
+    )
+    with pytest.raises(ConfigError, match="needs the training cameras"):
+        VisDomSampler(hull, epsilon_capture_radii=0.2)
+
+
+def test_the_band_may_reach_less_far_in_front(hull, rays):
+    origins, directions = rays
+    whole, half = (VisDomSampler(hull, epsilon_world=0.3, front_share=share) for share in (1.0, 0.5))
+    a, b = (sampler.bound(origins, directions, 0.0, 50.0) for sampler in (whole, half))
+    assert torch.equal(a.hit, b.hit) and a.hit.any() and torch.equal(a.far, b.far)
+    first = cast(hull, origins, directions).t_first[a.hit]
+    length = directions[a.hit].norm(dim=-1)
+    torch.testing.assert_close(a.near[a.hit], first - 0.3 / length)
+    torch.testing.assert_close(b.near[a.hit], first - 0.15 / length)
 
 
 def test_there_is_one_set_of_defaults(hull):
@@ -178,6 +196,8 @@ def test_only_hooks_that_say_so_filter_samples(hull):
         {"epsilon_world": float("nan")},
         {"epsilon_world": 0.0, "interval": "first_hit"},
         {"epsilon_world": 0.1, "epsilon_hull_radii": 0.1},
+        {"epsilon_world": 0.1, "epsilon_capture_radii": 0.1},
+        {"front_share": -0.1},
         {"epsilon_camera_distances": -0.1},
         {"interval": "exit"},
         {"missing": "drop"},

@@ -128,6 +128,9 @@ class Common(FolderOptions):
     was interrupted, is resumed all the same."""
     checkpoint_seconds: float = 30.0
     """Seconds between checkpoints; results do not depend on it."""
+    snapshots: int = 0
+    """States to keep besides the newest, evenly spaced over the schedule, for visdom-eval --oracle; results do not
+    depend on it."""
     config: Path | None = None
     """YAML file with settings, as --show-config prints them."""
     view: bool = False
@@ -209,6 +212,8 @@ def parse(
         config=(tyro.conf.AvoidSubcommands,),
     )
     common = Common(**{f.name: getattr(parsed, f.name) for f in fields(Common)})
+    if common.snapshots < 0:
+        raise ConfigError(f"--snapshots {common.snapshots} is out of range", todo="give 0 or more")
     common = replace(common, budget=budget, data=common.scene_folder, folder=None)
     return Request(preset, parsed.method, common, note)
 

@@ -44,6 +44,16 @@ def show_files(folder: Path, named: Iterable[tuple[str, str]]) -> None:
             print(f"{label:>8}: {folder / name}")
 
 
+def show_oracle(record: dict[str, Any]) -> None:
+    """What choosing among the snapshots of a run on its test views would have gained, on stdout."""
+    chosen, last = record["selected_on_test"], record["metrics"]["test"]["psnr"]
+    best = chosen["by_step"][str(chosen["step"])]["psnr"]
+    print(
+        f"oracle: {best:.2f} dB after step {chosen['step']}, {best - last:+.2f} dB against the last step; "
+        f"SELECTED ON THE TEST SET, the best of {len(chosen['by_step'])} snapshots: not a result of the method"
+    )
+
+
 def show_result(record: dict[str, Any], folder: Path) -> None:
     """The metrics table, the times and where the pictures are."""
     from rich.console import Console

@@ -43,13 +43,14 @@ def train_as_asked(
         request=options.describe_reading(common),
         on_finished=on_finished,
         tensorboard=tensorboard,
+        snapshots=common.snapshots,
     )
 
 
 def default_run_dir(scene: str, views: int, method: str, seed: int) -> Path:
     """runs/<scene>/<views>/<method>/<seed>, below the working directory."""
-    safe = re.sub(r"[^\w.+-]+", "_", scene).strip(".") or "scene"
-    return Path("runs") / safe / str(views) / method / str(seed)
+    safe, named = (re.sub(r"[^\w.+-]+", "_", word).strip(".") for word in (scene, method))
+    return Path("runs") / (safe or "scene") / str(views) / named / str(seed)
 
 
 def load_again(record: dict[str, Any], run: Path, data: Path | None, *, test: bool = True) -> Scene:

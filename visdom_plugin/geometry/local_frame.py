@@ -61,6 +61,15 @@ def local_origin(cameras: Cameras) -> Tensor:
     return step * torch.round((middle + centre) / step)
 
 
+def capture_ball(cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Mean (3,) of the camera centres and the largest distance of a camera (N,) from it, a scalar, scene units.
+
+    The frame and the unit of length in which the VisDom authors' release states its numbers.
+    """
+    centre = cameras.centres.mean(0)
+    return centre, (cameras.centres - centre).norm(dim=-1).max()
+
+
 def mean_distance(cameras: Cameras, target: Tensor | None = None) -> Tensor:
     """Scalar mean distance of the cameras (N,) from a point (3,), by default the one they look at, scene units."""
     target = look_at_point(cameras) if target is None else target

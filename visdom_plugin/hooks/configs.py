@@ -40,12 +40,16 @@ class RegularizerConfig(RegularizerSettings):
 
     enabled: bool = False
     """Whether the hook takes part at all; off leaves the base method unchanged."""
+    loss_hull: VisibleDomain | None = None
+    """The hull that L_i goes by, carved for it; by default the method's own. The VisDom authors' release has two:
+    Gaussians start in one, L_i looks at the other."""
 
     def build(self, hull: Hull, views: Views) -> VisDomGaussianRegularizer:
         """The hook for one hull and the training views whose colours the initial points take."""
         from visdom_plugin.hooks.regularizer import VisDomGaussianRegularizer
 
-        return VisDomGaussianRegularizer(hull, views.cameras, self, images=views.images)
+        other = None if self.loss_hull is None else self.loss_hull.carve(*views.silhouettes())
+        return VisDomGaussianRegularizer(hull, views.cameras, self, images=views.images, loss_hull=other)
 
 
 @dataclass(frozen=True, kw_only=True)

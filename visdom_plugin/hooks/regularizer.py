@@ -19,10 +19,11 @@ from visdom_plugin.geometry.cameras import Cameras, project, require_batch
 from visdom_plugin.geometry.local_frame import is_near
 from visdom_plugin.hooks.protocols import Placed
 from visdom_plugin.hooks.settings import RegularizerSettings
+from visdom_plugin.hooks.virtual_views import midpoint_views
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.point_colours import check_images, colour_points
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
-from visdom_plugin.hull.queries.shell_points import sample_shell
+from visdom_plugin.hull.queries.shell_points import sample_shell, voxel_centres
 from visdom_plugin.losses import OPAQUE
 
 log = logging.getLogger(__name__)
@@ -134,6 +135,7 @@ class VisDomGaussianRegularizer:
         config: its settings, RegularizerSettings's own by default.
         images: N tensors or arrays (H, W, 3) of the cameras' sizes, integers in 0..255 or floats in [0, 1], that
             colour the initial points; grey without.
+        loss_hull: the hull that L_i goes by, by default the same.
         settings: single fields of the config to change: `VisDomGaussianRegularizer(hull, cameras, weight=0.1)`.
 
     Raises:
@@ -148,6 +150,7 @@ class VisDomGaussianRegularizer:
         config: RegularizerSettings | None = None,
         *,
         images: Sequence[Tensor | np.ndarray] | None = None,
+        loss_hull: Hull | None = None,
         **settings: Any,
     ):
         require_batch(cameras, "VisDomGaussianRegularizer")
@@ -162,27 +165,32 @@ class VisDomGaussianRegularizer:
             and c.every >= 1
             and c.views_per_step >= 1
             and c.bank >= 0
-            and c.points in ("surface", "volume", "shell")
+            and c.views in ("between", "midpoints")
+            and c.points in ("surface", "volume", "shell", "voxels")
             and c.prune_every >= 0
             and 0 <= c.prune_margin_voxels < math.inf
         ):
             raise ConfigError(
-                f"weight={c.weight}, every={c.every}, views_per_step={c.views_per_step}, bank={c.bank}, "
+                f"weight={c.weight}, every={c.every}, views_per_step={c.views_per_step}, "
+                f"views={c.views!r}, bank={c.bank}, "
                 f"points={c.points!r}, prune_every={c.prune_every}, prune_margin_voxels={c.prune_margin_voxels}: "
                 "weight, bank, prune_every and prune_margin_voxels must be >= 0, every and views_per_step >= 1, "
-                "points 'surface', 'volume' or 'shell'",
+                "views 'between' or 'midpoints', points 'surface', 'volume', 'shell' or 'voxels'",
                 where="VisDomGaussianRegularizer",
             )
-        self.hull, self.cameras = hull, cameras.to("cpu")
-        _check_frame(hull, self.cameras)
+        self.hull, self.cameras, self.loss_hull = hull, cameras.to("cpu"), loss_hull or hull
+        for one in {id(h): h for h in (hull, self.loss_hull)}.values():
+            _check_frame(one, self.cameras)
         self.images = None if images is None else check_images(images, self.cameras)
         self._device = cameras.width.device
         self._bank: dict[int, tuple[Cameras, Tensor]] = {}
+        self._midpoints = midpoint_views(self.cameras) if c.views == "midpoints" else []
         self._look_at = torch.as_tensor(hull.centre).to(self.cameras.world_from_camera)
         self._warned = False
 
     def initial_points(self, n: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Points to start from: xyz (n, 3) world frame and rgb (n, 3) in [0, 1], on the device of the cameras.
+        """Points to start from: xyz (n, 3) world frame and rgb (n, 3) in [0, 1], on the device of the cameras;
+        fewer where `points` is "voxels" and the hull has fewer.
 
         They lie in `hull.inner`, the shape inside the hull, where the hull has one; in the hull itself without.
 
@@ -190,7 +198,12 @@ class VisDomGaussianRegularizer:
         float64. Trainers in float32 want `hull.relative_to(origin)` and `cameras.relative_to(origin)` there.
         """
         shape = self.hull.inner or self.hull
-        draw = {"surface": Hull.sample_points, "volume": Hull.sample_inside, "shell": sample_shell}
+        draw = {
+            "surface": Hull.sample_points,
+            "volume": Hull.sample_inside,
+            "shell": sample_shell,
+            "voxels": voxel_centres,
+        }
         xyz = draw[self.config.points](shape, n, generator)
         if is_near(self.hull.extent, float(np.ptp(self.hull.extent, axis=0).max())):
             xyz = xyz.float()
@@ -226,8 +239,8 @@ class VisDomGaussianRegularizer:
         if not self._is_due(step):
             return {}
         losses = []
-        for _ in range(self.config.views_per_step):
-            camera, mask = self._draw(generator)
+        for i in range(self.config.views_per_step):
+            camera, mask = self._draw(step, i, generator)
             alpha = _opacity(render(camera), mask.shape)
             losses.append(outside_loss(alpha, mask.to(alpha.device)))
         return {"visdom_outside": self.config.weight / len(losses) * sum(losses[1:], losses[0])}
@@ -245,17 +258,28 @@ class VisDomGaussianRegularizer:
         return c.weight > 0 and step >= c.start and (step - c.start) % c.every == 0
 
     @_outside_graphs
-    def _draw(self, generator: Generator | None) -> tuple[Cameras, Tensor]:
-        """A view and the hull's silhouette in it, (H, W) bool."""
-        if not self.config.bank:
+    def _draw(self, step: int | None, i: int, generator: Generator | None) -> tuple[Cameras, Tensor]:
+        """The i-th view of a step and the hull's silhouette in it, (H, W) bool."""
+        if not self.config.bank and not self._midpoints:
             camera = self.sample_camera(generator)
-            return camera.to(self._device), depth_and_silhouette(self.hull, camera)[1]
-        index = int(torch.randint(self.config.bank, (), generator=generator))
+            return camera.to(self._device), depth_and_silhouette(self.loss_hull, camera)[1]
+        index = self._choose(step, i, generator)
         if index not in self._bank:
-            camera = self.sample_camera(torch.Generator().manual_seed(index))
-            silhouette = depth_and_silhouette(self.hull, camera)[1]
+            if self._midpoints:
+                camera = self._midpoints[index]
+            else:
+                camera = self.sample_camera(torch.Generator().manual_seed(index))
+            silhouette = depth_and_silhouette(self.loss_hull, camera)[1]
             self._bank[index] = camera.to(self._device), silhouette.to(self._device)
         return self._bank[index]
+
+    def _choose(self, step: int | None, i: int, generator: Generator | None) -> int:
+        """Which view of the bank, or of the midpoints, every one of which has its turn before any has another."""
+        c, count = self.config, len(self._midpoints) or self.config.bank
+        if not self._midpoints or step is None:
+            return int(torch.randint(count, (), generator=generator))
+        turn, position = divmod((step - c.start) // c.every * c.views_per_step + i, count)
+        return int(torch.randperm(count, generator=torch.Generator().manual_seed(turn))[position])
 
     def after_step(self, gaussians: Placed, step: int) -> Tensor | None:
         """(N,) bool, True for Gaussians the trainer should remove, or None when there is nothing to do.

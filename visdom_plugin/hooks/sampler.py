@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import Cameras, rays_of_pixels
+from visdom_plugin.geometry.local_frame import capture_ball
 from visdom_plugin.hooks import torch_ops
 from visdom_plugin.hooks.protocols import EmptyRays, RayBounds
 from visdom_plugin.hooks.settings import SamplerSettings
@@ -38,17 +39,25 @@ def _limit(value: Tensor | float, like: Tensor) -> Tensor:
 
 
 def _epsilon_world(config: SamplerSettings, hull: Hull, cameras: Cameras | None) -> float:
-    """Half width of the band in scene units."""
-    if config.epsilon_hull_radii is not None and config.epsilon_world is not None:
+    """How far the band reaches from the hull, in scene units."""
+    units = ("epsilon_hull_radii", "epsilon_world", "epsilon_capture_radii")
+    given = [f"{name} = {getattr(config, name)}" for name in units if getattr(config, name) is not None]
+    if len(given) > 1:
         raise ConfigError(
-            f"epsilon is given twice: {config.epsilon_hull_radii} hull radii and {config.epsilon_world} scene "
-            "units",
-            todo="give one of epsilon_hull_radii and epsilon_world",
+            f"epsilon is given twice: {' and '.join(given)}", todo=f"give one of {', '.join(units)}"
         )
     if config.epsilon_world is not None:
         return config.epsilon_world
     if config.epsilon_hull_radii is not None:
         return config.epsilon_hull_radii * hull.radius
+    if config.epsilon_capture_radii is not None:
+        if cameras is None:
+            raise ConfigError(
+                "epsilon_capture_radii needs the training cameras, whose spread is its unit",
+                where="VisDomSampler",
+                todo="pass the batch of all training cameras: VisDomSampler(hull, cameras=cameras, ...)",
+            )
+        return config.epsilon_capture_radii * float(capture_ball(cameras)[1])
     distance = CAMERA_DISTANCE_HULL_RADII * hull.radius
     if cameras is not None:
         offsets = cameras.centres.cpu().numpy() - hull.centre
@@ -94,8 +103,9 @@ class VisDomSampler:
         first_hit:  [t_first - epsilon, t_first + epsilon]   (the paper's)
         entry_exit: [t_first - epsilon, t_last + epsilon]
 
-    cut to the caller's [near, far]. That is for the rays of training, beside a mask loss (`losses.mask_loss`, with
-    the paper's weight 0.1); novel views are drawn over the full range.
+    cut to the caller's [near, far]; `front_share` shortens the part in front. That is for the rays of training,
+    beside a mask loss (`losses.mask_loss`, with the paper's weight 0.1); novel views are drawn over the full
+    range.
 
     Args:
         hull: the visible domain; fixed from here on.
@@ -140,6 +150,12 @@ class VisDomSampler:
                 f"epsilon = {epsilon:g} scene units leaves no band to sample",
                 cause="an empty hull, or an epsilon that is negative, zero or not a number",
                 todo="give a positive epsilon_camera_distances, epsilon_hull_radii or epsilon_world",
+            )
+        if not 0 <= config.front_share < float("inf"):
+            raise ConfigError(
+                f"front_share = {config.front_share} is out of range",
+                where="VisDomSampler",
+                todo="choose 0 or more",
             )
         self._outside: OutsideRays | None = None
         if config.virtual_views != "none":
@@ -268,7 +284,8 @@ class VisDomSampler:
         far = torch.maximum(far, near)
         last = first if self.config.interval == "first_hit" else crossing.t_last
         epsilon = self.epsilon_world / directions.norm(dim=-1).to(first)
-        begin, end = torch.maximum(near, first - epsilon), torch.minimum(far, last + epsilon)
+        front = epsilon if self.config.front_share == 1 else self.config.front_share * epsilon
+        begin, end = torch.maximum(near, first - front), torch.minimum(far, last + epsilon)
         hit = crossing.hit & (begin < end)
         if half:
             rounding = torch.finfo(half).eps

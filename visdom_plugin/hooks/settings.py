@@ -16,7 +16,13 @@ class SamplerSettings:
     epsilon_hull_radii: float | None = None
     """The same in radii of the hull, in place of camera distances."""
     epsilon_world: float | None = None
-    """The same in units of the scene; give one of these two."""
+    """The same in units of the scene."""
+    epsilon_capture_radii: float | None = None
+    """The same in largest distances of a training camera from their mean, the unit of the VisDom authors' release
+    (0.2); give one of these three at most."""
+    front_share: float = 1.0
+    """How much of epsilon the band reaches in front of the first hit; behind the last it is the whole. The
+    release has 0.5: 0.1 in front, 0.2 behind."""
     interval: Literal["first_hit", "entry_exit"] = "entry_exit"
     """Around the first hit, as the paper writes, or from before the first to behind the last."""
     missing: Literal["full", "skip"] = "full"
@@ -50,12 +56,17 @@ class RegularizerSettings:
     """First step with L_i."""
     views_per_step: int = 1
     """Interpolated views per loss."""
+    views: Literal["between", "midpoints"] = "between"
+    """Where these views stand: anywhere on the way between random pairs of training cameras, swinging round the
+    hull; or halfway between each camera and its two nearest ones, each as often as the others (the VisDom authors'
+    release)."""
     bank: int = 64
-    """Views to draw from, made once, so that the hull's silhouette is cast once for each; 0 draws a new view
-    every time."""
-    points: Literal["surface", "volume", "shell"] = "volume"
-    """Where initial points lie: on the hull's surface; anywhere inside it, where the object is; or inside it, most
-    of them near the surface, so that thin parts have enough."""
+    """Views "between" to draw from, made once, so that the hull's silhouette is cast once for each; 0 draws a new
+    view every time."""
+    points: Literal["surface", "volume", "shell", "voxels"] = "volume"
+    """Where initial points lie: on the hull's surface; anywhere inside it, where the object is; inside it, most
+    of them near the surface, so that thin parts have enough; or in the middles of its voxels, all of them where
+    that are no more than asked for (the release)."""
     prune_every: int = 50
     """Remove Gaussians whose centres lie outside the hull on every n-th step; 0 leaves them to L_i."""
     prune_margin_voxels: float = 2.0

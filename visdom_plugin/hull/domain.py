@@ -87,14 +87,14 @@ class VisibleDomain(HullSettings):
             from visdom_plugin.hull.checks.explain_failure import refuse_other_unit
 
             refuse_other_unit(cameras, silhouettes)
-        settings = self
+        settings = self._in_bounds(cameras)
         if self.k == "auto" and self.kind != "released-go":
             from visdom_plugin.hull.checks.covisibility import advise_k
             from visdom_plugin.hull.checks.distance_fields import draw_outlines
 
             advice = advise_k(draw_outlines(cameras, silhouettes))
             log.info("k=auto takes %s", advice.why)
-            settings = replace(self, k=advice.k)
+            settings = replace(settings, k=advice.k)
         hull = carve_silhouettes(settings, cameras, silhouettes, device=getattr(masks[0], "device", "cpu"))
         if hull is None:
             from visdom_plugin.hull.checks.explain_failure import explain_empty
@@ -131,6 +131,16 @@ class VisibleDomain(HullSettings):
             made["seconds"] + made["bounds_seconds"],
         )  # fmt: skip
         return hull
+
+    def _in_bounds(self, cameras: Cameras) -> VisibleDomain:
+        """The same settings, with the cube of `bounds_capture_radii` as bounds where one is asked for."""
+        if self.bounds_capture_radii is None:
+            return self
+        from visdom_plugin.geometry.local_frame import capture_ball
+
+        centre, radius = (x.cpu().double().numpy() for x in capture_ball(cameras))
+        low, high = ((centre + sign * self.bounds_capture_radii * radius).tolist() for sign in (-1, 1))
+        return replace(self, bounds=(tuple(low), tuple(high)), bounds_capture_radii=None)
 
 
 TRAINING_DOMAIN = VisibleDomain(dilate_px=1)

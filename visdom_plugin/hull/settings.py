@@ -28,6 +28,13 @@ class HullSettings:
     rule."""
     bounds: Box | None = None
     """Lower and upper corner of the grid in world units, in place of automatic bounds."""
+    bounds_capture_radii: float | None = None
+    """Half side of a cube around the cameras' mean, in largest distances of a camera from there, in place of
+    automatic bounds. The VisDom authors' release has 2, with 512 voxels along a side; its mean is over all cameras
+    of the capture, here over those that carve."""
+    bounds_scale: float = 1.0
+    """How much longer than found the automatic bounds are made, about their centre. The release doubles them for
+    the points that Gaussians start from."""
     resolution: int = 256
     """Voxels along the grid's longest side."""
     components: Literal["explain", "drop-small", "all", "largest"] = "explain"
@@ -70,6 +77,11 @@ class HullSettings:
             refuse(f"dilate_px is {self.dilate_px}", "use 0 or more pixels")
         if self.sphere_radius is not None and not 0 < self.sphere_radius < math.inf:
             refuse(f"sphere_radius is {self.sphere_radius}", "use a positive length in world units")
+        radii = self.bounds_capture_radii
+        if radii is not None and not (0 < radii < math.inf and self.bounds is None):
+            refuse(f"bounds_capture_radii is {radii}", "use a positive number, and no bounds beside it")
+        if not 1 <= self.bounds_scale < math.inf:
+            refuse(f"bounds_scale is {self.bounds_scale}", "use 1 or more")
         if self.bounds is not None:
             corners = [list(corner) for corner in self.bounds]
             shaped = len(corners) == 2 and all(len(c) == 3 for c in corners)

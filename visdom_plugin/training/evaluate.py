@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -41,7 +41,7 @@ def evaluate(
     device: torch.device,
     folder: Path | None = None,
     progress: Progress | None = None,
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Measures every view and, with a folder, writes its render and the contact sheet.
 
     A view whose mask is not its own has no truth on white: it is rendered, its metrics are NaN, it takes no part

@@ -73,6 +73,7 @@ def train(
     budget: str | None = None,
     on_finished: OnFinished | None = None,
     tensorboard: Path | None = None,
+    snapshots: int = 0,
 ) -> Record:
     """Trains, evaluates and writes the run directory; resumes the same run where it was left.
 
@@ -85,6 +86,8 @@ def train(
         tensorboard: folder for TensorBoard's files, with numbers and pictures.
         on_finished: called at the end of a run that this call finishes; what it raises is logged, no
             more.
+        snapshots: states to keep besides, evenly spaced over the schedule, for `selection.select_on_test`; the
+            result does not depend on it.
 
     Returns:
         run.json's content, with `resumed_from` (step, or None) and `already_finished` added.
@@ -121,7 +124,17 @@ def train(
         run.update(status="running", budget=budget, **circumstances)
         try:
             resumed, method, hull = _run(
-                preset, config, scene, run, data_manager, device, seed, quiet, checkpoint_seconds, board
+                preset,
+                config,
+                scene,
+                run,
+                data_manager,
+                device,
+                seed,
+                quiet,
+                checkpoint_seconds,
+                board,
+                snapshots,
             )
         except KeyboardInterrupt:
             run.update(status="interrupted")
@@ -155,6 +168,7 @@ def _run(
     quiet: bool,
     checkpoint_seconds: float,
     board: TensorBoard | None,
+    snapshots: int,
 ) -> tuple[int | None, Method, Hull | None]:
     """Where it went on from, and what was trained."""
     saved = run.path / "hull"
@@ -178,6 +192,7 @@ def _run(
         checkpoint_seconds=checkpoint_seconds,
         train_psnr=view_psnr(method, scene.train, device),
         watch=Live(pictures, board),
+        snapshots=snapshots,
     )
     if not trainer.run():
         raise Interrupted

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 import torch
@@ -22,6 +23,8 @@ from visdom_plugin.training.runs.run_directory import Record, RunDir
 
 LOGGED = 100
 """Lines in log.jsonl over the whole schedule."""
+SNAPSHOTS = "snapshots"
+"""Folder of a run directory with the states kept on the way."""
 CUDA_CHECK_EVERY = 20
 """On CUDA, reading the loss stalls the device: NaN is looked for on every n-th step and before saving."""
 
@@ -48,6 +51,7 @@ class Trainer:
         checkpoint_seconds: float = 30,
         train_psnr: Callable[[int], float] | None = None,
         watch: Callable[[Record], str | None] = lambda _: None,
+        snapshots: int = 0,
     ):
         """
         Args:
@@ -57,10 +61,13 @@ class Trainer:
             train_psnr: PSNR of a training view for the progress line, a function of the step; used where the
                 method's steps give no metric "psnr" of their own.
             watch: is handed each line of the log; what it returns is said beside the progress.
+            snapshots: how many states, evenly spaced over the schedule up to its end, are kept beside the
+                checkpoints.
         """
         self.method, self.batch_of, self.run_dir = method, batch_of, run
         self.device, self.quiet, self.checkpoint_seconds = device, quiet, checkpoint_seconds
         self.train_psnr, self.watch = train_psnr, watch
+        self.snapshots = snapshots
         self.folder = run.path / "checkpoints"
         self.step, self.train_s = 0, 0.0
         self.stopped = False
@@ -74,6 +81,7 @@ class Trainer:
         """
         self._resume()
         total = self.method.total_steps
+        keep_at = {round(total * (i + 1) / self.snapshots) for i in range(self.snapshots)}
         log_every = max(1, total // LOGGED)
         check_every = CUDA_CHECK_EVERY if self.device.type == "cuda" else 1
         loss = psnr = None
@@ -103,6 +111,8 @@ class Trainer:
                     row |= summarise(self.method)
                     row |= {"psnr": psnr, "train_s": round(self.train_s, 3)}
                     self.run_dir.log(row)
+                if self.step in keep_at:
+                    self._save_to(self.run_dir.path / SNAPSHOTS, kept=None)
                 if save:
                     self._save()
                     saved = time.monotonic()
@@ -126,9 +136,12 @@ class Trainer:
         self.run_dir.truncate_log(self.step)
 
     def _save(self) -> None:
-        if self.step not in checkpoints.list_steps(self.folder):
+        self._save_to(self.folder, kept=checkpoints.KEPT)
+
+    def _save_to(self, folder: Path, kept: int | None) -> None:
+        if self.step not in checkpoints.list_steps(folder):
             notes = {"train_s": self.train_s, "total_steps": self.method.total_steps}
-            checkpoints.save(self.folder, self.step, self.method.state_dict(), notes)
+            checkpoints.save(folder, self.step, self.method.state_dict(), notes, kept=kept)
 
     def _measure_psnr(self, output: StepOutput, log_every: int) -> float | None:
         own = output.metrics.get("psnr")

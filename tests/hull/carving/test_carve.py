@@ -216,6 +216,26 @@ def test_explicit_bounds_are_the_grid():
     assert hull.shape == (40, 20, 30) and np.allclose(hull.bounds, [[-1, -0.5, -1], [1, 0.5, 0.5]])
 
 
+def test_bounds_may_count_from_the_cameras():
+    cameras = ring(5)
+    masks = ball_masks(cameras, BALLS)
+    hull = VisibleDomain(bounds_capture_radii=0.5, resolution=40).carve(cameras, masks)
+    centre = cameras.centres.mean(0).numpy()
+    reach = 0.5 * np.linalg.norm(cameras.centres.numpy() - centre, axis=1).max()
+    assert hull.shape == (40, 40, 40) and np.allclose(hull.bounds, [centre - reach, centre + reach])
+    given = VisibleDomain(bounds=tuple(map(tuple, hull.bounds.tolist())), resolution=40)
+    assert given.carve(cameras, masks) == hull
+
+
+def test_found_bounds_may_be_made_longer():
+    cameras = ring(5)
+    masks = ball_masks(cameras, BALLS)
+    tight, wide = (VisibleDomain(resolution=96, bounds_scale=s).carve(cameras, masks) for s in (1.0, 2.0))
+    side = [float(np.ptp(h.bounds, axis=0)[0]) for h in (tight, wide)]
+    assert np.allclose(tight.bounds.mean(0), wide.bounds.mean(0), atol=1e-6)
+    assert side[1] == pytest.approx(2 * side[0]) and wide.volume == pytest.approx(tight.volume, rel=0.1)
+
+
 def test_named_values_of_k(caplog):
     cameras = ring(5)
     masks = ball_masks(cameras, BALLS)
@@ -250,6 +270,7 @@ def test_carving_twice_gives_the_same_bits():
         {"k": 0}, {"k": "all"}, {"agreement": 0.0}, {"agreement": 1.5}, {"max_misses": -1}, {"kind": "cone"},
         {"resolution": 2}, {"bounds": ((0, 0, 0), (0, 1, 1))}, {"components": "some"}, {"dilate_px": -1},
         {"sphere_radius": -1.0}, {"min_component_fraction": 2.0}, {"bounds": ((0, 0), (1, 1))},
+        {"bounds_capture_radii": 0.0}, {"bounds_capture_radii": 2.0, "bounds": BOX}, {"bounds_scale": 0.5},
     ],
 )  # fmt: skip
 def test_settings_out_of_range_are_refused(wrong):

@@ -29,6 +29,10 @@ class Options:
     """Folder of the scene, if it has moved."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device to compute on."""
+    oracle: bool = False
+    """Also measure the states that visdom-train --snapshots N kept, and note the one that is best on the test
+    views. It is chosen by looking at the answers: it says what such a choice is worth, and is no result of the
+    method."""
     quiet: bool = False
     """Print nothing but errors."""
 
@@ -45,7 +49,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         return leave_one_out.main([word for word in argv if word != "--leave-one-out"])
     options = tyro.cli(Options, args=argv, prog="visdom-eval")
 
-    from visdom_plugin.cli.report import say, show_result
+    from visdom_plugin.cli.report import say, show_oracle, show_result
     from visdom_plugin.cli.runs import open_run
     from visdom_plugin.training.run import evaluate_again
 
@@ -54,8 +58,14 @@ def _evaluate(argv: Sequence[str]) -> int:
         say(f"the run is {record['status']}: this is its state after {step} steps")
     quiet = options.quiet
     record = evaluate_again(method, config, hull, scene, device=device, run_dir=options.run, quiet=quiet)
+    if options.oracle:
+        from visdom_plugin.training.selection import select_on_test
+
+        record = select_on_test(method, scene.test, device=device, run_dir=options.run)
     if not quiet:
         show_result(record, options.run)
+    if options.oracle:
+        show_oracle(record)
     return 0
 
 

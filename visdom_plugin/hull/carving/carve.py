@@ -54,6 +54,8 @@ def carve_silhouettes(
         box = occupied_box(occupancy)
         if (box[1] - box[0]).max() > _LOOSE * settings.resolution:
             break
+        if settings.bounds_scale > 1:
+            break
         margin = np.array([[-1], [1]]) * (2 + 0.05 * (box[1] - box[0]).max())
         grid = cube_around(grid.lower + (box + margin) * grid.voxel, settings.resolution)
         found = _carve_grid(settings, policy, search, grid, ball, device)
@@ -132,6 +134,8 @@ def _place(settings: HullSettings, cameras: Cameras, search: Search) -> tuple[Gr
     elif _one_view_is_enough(settings, search.rule):
         centres = cameras.centres.double().cpu().numpy()
         box = np.stack([np.minimum(box[0], centres.min(0)), np.maximum(box[1], centres.max(0))])
+    middle = box.mean(0)
+    box = middle + settings.bounds_scale * (box - middle)
     return cube_around(box, settings.resolution), ball, region.closed
 
 

@@ -1,4 +1,5 @@
-"""Points inside a hull, denser near its surface: what cameras see, and all there is of thin parts."""
+"""Points inside a hull: denser near its surface, which is what cameras see and all there is of thin parts; or one
+in each voxel."""
 
 from __future__ import annotations
 
@@ -31,6 +32,22 @@ def sample_shell(hull: Hull, n: int, generator: Generator | None = None) -> Tens
     chosen = np.searchsorted(cumulative, draw[:, 0] * cumulative[-1], side="right")
     corner = index[np.minimum(chosen, len(index) - 1)]
     return torch.from_numpy(hull.bounds[0] + (corner + draw[:, 1:]) * hull.voxel_edges)
+
+
+def voxel_centres(hull: Hull, n: int, generator: Generator | None = None) -> Tensor:
+    """Centres of the hull's voxels; where there are more than `n`, n of them, drawn without replacement.
+
+    Args:
+        n: how many at most.
+        generator: CPU generator; torch's global one without.
+
+    Returns:
+        (m, 3) float64, world frame, m <= n; (0, 3) for an empty hull.
+    """
+    index = np.argwhere(hull.occupancy)
+    if len(index) > n:
+        index = index[torch.randperm(len(index), generator=generator)[:n].sort().values.numpy()]
+    return torch.from_numpy(hull.bounds[0] + (index + 0.5) * hull.voxel_edges)
 
 
 def _weigh(hull: Hull) -> tuple[np.ndarray, np.ndarray]:

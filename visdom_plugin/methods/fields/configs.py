@@ -23,12 +23,24 @@ class FieldConfig(SamplerMethodConfig):
     colour_correction: bool = False
     """Fit an affine map of colours to each training view, for captures whose exposure or white balance changes;
     novel views have the colours of the average one."""
+    few_views: int = 4
+    """Up to how many training views are few, for `few_views_share`."""
+    few_views_share: float = 1.0
+    """Share of the schedule after which training stops where there are few training views. The VisDom authors'
+    release stops Zip-NeRF at 6,000 of 25,000 steps with 4 views."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         shapeless = self.prior_weight > 0 and self.hull is None
         fits = self.prior_weight >= 0 and not shapeless
-        demand(self, {"prior_weight": (fits, "0, or more where there is a hull, as in the variant +vd")})
+        demand(
+            self,
+            {
+                "prior_weight": (fits, "0, or more where there is a hull, as in the variant +vd"),
+                "few_views": (self.few_views >= 0, "0 or more"),
+                "few_views_share": (0 < self.few_views_share <= 1, "a share above 0, at most 1"),
+            },
+        )
 
 
 @dataclass(frozen=True)
@@ -127,6 +139,9 @@ class ZipNerfConfig(FieldConfig):
     near: float = 0.05
     far: float = 1e6
     """Space beyond the cameras is contracted into a ball of radius 2."""
+    spacing_power: float = -1.5
+    """Of the power ladder along which samples are spaced (Zip-NeRF: short steps near the camera, long ones far
+    from it). 1 is even spacing, as in the VisDom authors' release."""
     samples: tuple[int, int, int] = (64, 64, 32)
     """Intervals per ray: two proposals, then the field itself."""
     test_samples: tuple[int, int, int] | None = None
@@ -163,6 +178,10 @@ class ZipNerfConfig(FieldConfig):
     blur: tuple[float, float] = (0.03, 0.003)
     """Half widths of the interlevel loss, in normalised distance."""
     anneal_slope: float = 10.0
+    proposal_mask_share: float = 0.0
+    """What the silhouette loss of each proposal weighs, as a share of the field's; 0.1 in the release."""
+    mask_clamp: float = 1e-6
+    """The silhouette loss takes opacity, and mask, to be at least this far from 0 and 1; 0.001 in the release."""
 
     lr: float = 0.00125
     lr_final: float = 0.000125
@@ -185,6 +204,9 @@ class ZipNerfConfig(FieldConfig):
                 "far": (self.far > self.near, f"more than near, {self.near}"),
                 "samples": (min(self.samples) >= 2, "2 or more for each level"),
                 "test_samples": (min(self.test_samples or (2,)) >= 2, "2 or more for each level"),
+                "spacing_power": (self.spacing_power != 0, "any number but 0"),
+                "proposal_mask_share": (self.proposal_mask_share >= 0, "0 or more"),
+                "mask_clamp": (0 < self.mask_clamp < 0.5, "a number above 0, below 0.5"),
                 "blur": (min(self.blur) > 0, "positive numbers"),
                 "view_degree": (self.view_degree >= 0, "0 or more"),
             },

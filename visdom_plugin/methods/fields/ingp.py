@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.protocols import SamplerHook, sample_filters
+from visdom_plugin.losses import mask_loss
 from visdom_plugin.methods.fields.common import (
     MESH_RESOLUTION,
     FieldMesh,
@@ -97,11 +98,14 @@ class Ingp(RadianceField[IngpConfig]):
         losses |= self.prior_losses(step) | self.empty_losses(n, step)
         return StepOutput(losses, {"psnr": psnr_of(rgb - target)})
 
-    def opacity(self, rays: LocalRays, radius: Tensor, step: int, generator: Generator) -> Tensor:
+    def silhouette_of_nothing(
+        self, rays: LocalRays, radius: Tensor, step: int, generator: Generator
+    ) -> Tensor:
         step_length = torch.full_like(rays.far, self.config.missing_step_length)
         shift = uniform(generator, self.device, len(rays.far))
         samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks)
-        return self._shade(rays, samples, rays.origins.new_ones(len(rays.far), 3))[1]
+        alpha = self._shade(rays, samples, rays.origins.new_ones(len(rays.far), 3))[1]
+        return mask_loss(alpha, torch.zeros_like(alpha))
 
     def optimise(self, step: int, output: StepOutput) -> None:
         c = self.config

@@ -13,7 +13,6 @@ from torch import Generator, Tensor
 from visdom_plugin.geometry.cameras import Cameras, pixel_radius
 from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook, empty_spaces
 from visdom_plugin.hull.hull import Hull
-from visdom_plugin.losses import mask_loss
 from visdom_plugin.methods.colour_correction import ColourCorrection, CorrectsColours
 from visdom_plugin.methods.fields.common import LocalRays, bound_rays, render_image, spread_rays
 from visdom_plugin.methods.fields.configs import IngpConfig, ZipNerfConfig
@@ -53,6 +52,8 @@ class RadianceField(CorrectsColours, ABC, Generic[Config]):
     ) -> None:
         self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
         self.frame = frame_of(views.cameras)
+        if len(views) <= self.config.few_views and self.config.few_views_share < 1:
+            self.total_steps = max(1, round(self.config.few_views_share * self.config.steps))
         cameras = views.cameras.to(device)
         for hook in self.hooks:
             if isinstance(hook, PixelSampler):
@@ -121,8 +122,10 @@ class RadianceField(CorrectsColours, ABC, Generic[Config]):
         return {"prior": self.config.prior_weight * loss}
 
     @abstractmethod
-    def opacity(self, rays: LocalRays, radius: Tensor, step: int, generator: Generator) -> Tensor:
-        """(n,) opacity along rays in a training step, with gradients.
+    def silhouette_of_nothing(
+        self, rays: LocalRays, radius: Tensor, step: int, generator: Generator
+    ) -> Tensor:
+        """The silhouette loss along rays whose mask is 0, a scalar; unweighted.
 
         Args:
             radius: (n,) of the pixels' cones at distance 1.
@@ -141,8 +144,8 @@ class RadianceField(CorrectsColours, ABC, Generic[Config]):
             empty = hook.empty_rays(photographed, draw, self.device)
             if len(empty.origins):
                 rays = self.bound(empty.origins, empty.directions, [])
-                alpha = self.opacity(rays, empty.radii, step, draw_on(self.device, draw))
-                losses.append(hook.virtual_weight * mask_loss(alpha, torch.zeros_like(alpha)))
+                loss = self.silhouette_of_nothing(rays, empty.radii, step, draw_on(self.device, draw))
+                losses.append(hook.virtual_weight * loss)
         return {"empty": sum(losses[1:], losses[0])} if losses else {}
 
     def correct(self, rgb: Tensor, alpha: Tensor, background: Tensor, pixels: Tensor | None) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.losses import mask_loss
 from visdom_plugin.methods.fields.common import (
     MESH_RESOLUTION,
     FieldMesh,
@@ -19,7 +20,6 @@ from visdom_plugin.methods.fields.common import (
     mesh_density,
     photograph_on,
     psnr_of,
-    silhouette_loss,
 )
 from visdom_plugin.methods.fields.configs import ZipNerfConfig
 from visdom_plugin.methods.fields.radiance_field import RadianceField
@@ -142,7 +142,8 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         error = rgb - target
         losses = {"colour": (error.square() + CHARBONNIER**2).sqrt().mean()}
         if c.mask_weight:
-            losses["mask"] = c.mask_weight * silhouette_loss(alpha, batch)
+            known = None if batch.mask_known is None else batch.mask_known.float()
+            losses["mask"] = c.mask_weight * self._silhouette_loss(levels, batch.mask, known)
         if c.interlevel_weight:
             proposals = (
                 antialiased_interlevel_loss(
@@ -161,9 +162,22 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         losses |= self.prior_losses(step) | self.empty_losses(len(batch.mask), step)
         return StepOutput(losses, {"psnr": psnr_of(error)})
 
-    def opacity(self, rays: LocalRays, radius: Tensor, step: int, generator: Generator) -> Tensor:
+    def silhouette_of_nothing(
+        self, rays: LocalRays, radius: Tensor, step: int, generator: Generator
+    ) -> Tensor:
         levels, _ = self._see(rays, radius, self.config.samples, step, generator)
-        return levels[-1].weights.sum(-1)
+        return self._silhouette_loss(levels, torch.zeros_like(radius))
+
+    def _silhouette_loss(self, levels: list[Level], mask: Tensor, known: Tensor | None = None) -> Tensor:
+        """Of the field, and of the proposals as far as the config asks; a scalar. `mask`, `known` (n,)."""
+        c = self.config
+        shares = [c.proposal_mask_share] * (len(levels) - 1) + [1.0]
+        losses = [
+            share * mask_loss(level.weights.sum(-1), mask, known, clamp=c.mask_clamp)
+            for share, level in zip(shares, levels, strict=True)
+            if share
+        ]
+        return reduce(torch.add, losses)
 
     def optimise(self, step: int, output: StepOutput) -> None:
         c = self.config
@@ -217,7 +231,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
             s, weights = before.s, before.weights.detach()
         jitter = None if generator is None else uniform(generator, self.device, n, 1)
         s = sample_edges(s, anneal(weights, progress, self.config.anneal_slope), count, jitter)
-        t = distances_of(s, near, far)
+        t = distances_of(s, near, far, self.config.spacing_power)
         turn = None if generator is None else uniform(generator, self.device, n, count)
         points, std = multisample(rays.origins, rays.directions, t, radius, turn)
         out = self.model[name](points, std)

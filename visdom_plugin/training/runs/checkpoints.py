@@ -35,8 +35,10 @@ class Checkpoint:
     """What the trainer wants to remember besides, e.g. the seconds spent."""
 
 
-def save(folder: Path, step: int, tensors: dict[str, Tensor], notes: Notes) -> Path:
-    """Writes the state after `step` steps and removes all but the newest `KEPT`.
+def save(
+    folder: Path, step: int, tensors: dict[str, Tensor], notes: Notes, *, kept: int | None = KEPT
+) -> Path:
+    """Writes the state after `step` steps and removes all but the newest `kept`; None keeps all.
 
     The JSON comes last: a state without it does not count. Returns the safetensors file.
     """
@@ -48,7 +50,7 @@ def save(folder: Path, step: int, tensors: dict[str, Tensor], notes: Notes) -> P
     write_bytes(path, data)
     digest = hashlib.sha256(data).hexdigest()
     write_json(path.with_suffix(".json"), {"step": step, "sha256": digest, "notes": notes})
-    for old in list_steps(folder)[:-KEPT]:
+    for old in list_steps(folder)[: -kept if kept else 0]:
         remove(folder, old)
     return path
 

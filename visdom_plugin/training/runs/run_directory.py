@@ -1,6 +1,6 @@
 """The run directory: what a training run leaves on disk, and who may write to it.
 
-    run.json  log.jsonl  checkpoints/  hull/{hull.npz,hull.ply,reference.npz}  renders/  export/
+    run.json  log.jsonl  checkpoints/  snapshots/  hull/{hull.npz,hull.ply,reference.npz}  renders/  export/
     report.html  report/
 
 A directory belongs to one config, one seed and one data set. It is resumed by the same, and never resumed or
@@ -38,7 +38,17 @@ IDENTITY = ("method", "scene", "seed", "config", "data")
 _WHEREABOUTS = ("path", "root", "split", "train_list", "test_list")
 """What `data` says of where the data lies and how its views were chosen. That may change, as may the scene's name;
 what must agree for a run to be resumed are the views' names, the hashes, and the other fields of `IDENTITY`."""
-_OURS = ("log.jsonl", "checkpoints", "hull", "renders", "export", "report", "report.html", "run.json")
+_OURS = (
+    "log.jsonl",
+    "checkpoints",
+    "snapshots",
+    "hull",
+    "renders",
+    "export",
+    "report",
+    "report.html",
+    "run.json",
+)
 _LOCK = "run.lock"
 
 
