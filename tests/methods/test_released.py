@@ -87,7 +87,7 @@ def test_proposals_may_follow_the_masks(scene, hull):  # noqa: F811
     seen = []
     look = shared._see
     shared._see = lambda *a: seen.append(look(*a)) or seen[-1]
-    losses = [float(m.train_step(batch, 0).losses["mask"]) for m in (plain, clamped, shared)]
+    losses = [float(m.train_step(batch, 0).losses["mask"].detach()) for m in (plain, clamped, shared)]
     alphas = [level.weights.sum(-1) for level in seen[0][0]]
     parts = [float(mask_loss(a, batch.mask)) for a in alphas]
     assert losses[0] == pytest.approx(0.1 * parts[2], rel=1e-5)
