@@ -47,10 +47,10 @@ def test_drawing_takes_its_share_of_the_time_and_no_more(tmp_path, monkeypatch, 
     pictures = live.LivePictures(
         method, views, torch.device("cpu"), tmp_path / "now.png", lambda _, step: sheets.append(step)
     )
-    calibration = per_pixel * (live.NARROWEST_PX // 2) ** 2 * 200 / 300
+    calibration = per_pixel * live.NARROWEST_PX**2 * 200 / 300
     for step in range(1, 101):
         pictures.refresh(step, train_s=step)
-        assert pictures.spent_s <= live.SHARE * step * 1.05 + calibration
+        assert pictures.spent_s <= 1.05 * (live.SHARE * step + calibration)
     assert all(live.NARROWEST_PX <= w <= live.WIDEST_PX for w in method.widths[1:])
     # Where a picture of the least size costs more than all the training pays for, there is none.
     assert (

@@ -233,4 +233,5 @@ def test_toggles_change_what_the_browser_shows(viewer):
         moved = next(iter(viewer.server.get_clients().values())).camera.position
         wanted = viewer.subject.scene.train.cameras[1].centres.numpy() - viewer.middle
         assert np.allclose(moved, wanted, atol=0.05) and not np.allclose(position, wanted, atol=0.05)
-        assert not [e for e in page.errors if "THREE" not in e]
+        # viser's quads of Gaussians have corners of two numbers, of which three.js wants a radius, in vain.
+        assert [e for e in page.errors if "Computed radius is NaN" not in e] == []

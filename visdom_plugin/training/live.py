@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
 SHEET = "renders/training_now.png"
-SHARE = 0.01
+SHARE = 0.015
 """Of the seconds trained, what drawing may take."""
 VIEWS, WIDEST_PX, NARROWEST_PX = 3, 200, 64
 """Training views on the sheet, at most; their width, of which the narrowest is worth looking at."""
@@ -52,21 +52,21 @@ class LivePictures:
         """Seconds that drawing took."""
         self.count = 0
         """Sheets drawn."""
-        self._per_pixel: float | None = None
+        self._per_pixel = self._per_sheet = 0.0
         shown = shown_on_sheet(len(views))
         self._chosen = shown[:: max(1, len(shown) // VIEWS)][:VIEWS]
 
     def refresh(self, step: int, train_s: float) -> bool:
         """Draws the sheet anew if its share of the seconds trained so far pays for it; whether it did."""
         began = time.monotonic()
-        left = SHARE * train_s - self.spent_s
+        left = SHARE * train_s - self.spent_s - self._per_sheet
         if left <= 0:
             return False
-        if self._per_pixel is None:
+        if not self._per_pixel:
             # Imports that the evaluation needs anyway, and how fast a picture is drawn.
             draw_sheet([("", [np.zeros((2, 2, 3), np.uint8)])], ("",))
             began = time.monotonic()
-            tiny = self._draw(self._chosen[0], NARROWEST_PX // 2)
+            tiny = self._draw(self._chosen[0], NARROWEST_PX)
             seconds = time.monotonic() - began
             self._per_pixel = seconds / (tiny.shape[0] * tiny.shape[1])
             self.spent_s += seconds
@@ -79,7 +79,8 @@ class LivePictures:
             return False
         drawn = [self._draw(i, width) for i in self._chosen]
         pixels = sum(picture.shape[0] * picture.shape[1] for picture in drawn)
-        self._per_pixel = (time.monotonic() - began) / pixels
+        rendered = time.monotonic() - began
+        self._per_pixel = rendered / pixels
         columns = [
             (self.views.names[i], [draw_truth(self.views, i, self.views.mask_origin(i) == "given"), picture])
             for i, picture in zip(self._chosen, drawn, strict=True)
@@ -87,7 +88,9 @@ class LivePictures:
         sheet = draw_sheet(columns, ("photograph", f"step {step}"))
         write_png(self.path, sheet)
         self.keep(sheet, step)
-        self.spent_s += time.monotonic() - began
+        seconds = time.monotonic() - began
+        self._per_sheet = seconds - rendered
+        self.spent_s += seconds
         self.count += 1
         return True
 
