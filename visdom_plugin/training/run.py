@@ -86,7 +86,7 @@ def train(
         tensorboard: folder for TensorBoard's files, with numbers and pictures.
         on_finished: called at the end of a run that this call finishes; what it raises is logged, no
             more.
-        snapshots: states to keep besides, evenly spaced over the schedule, for `selection.select_on_test`; the
+        snapshots: states to keep besides, evenly spaced over the schedule, for `visdom-eval --oracle`; the
             result does not depend on it.
 
     Returns:

@@ -59,7 +59,7 @@ def _evaluate(argv: Sequence[str]) -> int:
     quiet = options.quiet
     record = evaluate_again(method, config, hull, scene, device=device, run_dir=options.run, quiet=quiet)
     if options.oracle:
-        from visdom_plugin.training.selection import select_on_test
+        from visdom_plugin.cli.evaluation.select_on_test import select_on_test
 
         record = select_on_test(method, scene.test, device=device, run_dir=options.run)
     if not quiet:

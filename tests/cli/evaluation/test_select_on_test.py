@@ -9,13 +9,15 @@ import pytest
 import torch
 
 from tests.training import fake
+from visdom_plugin import registry
 from visdom_plugin.cli.commands import evaluate as command
 from visdom_plugin.cli.commands import train as train_command
+from visdom_plugin.cli.evaluation.select_on_test import select_on_test
 from visdom_plugin.errors import CheckpointError, SceneError
 from visdom_plugin.scene import Views
+from visdom_plugin.training import run
 from visdom_plugin.training.evaluate import evaluate
 from visdom_plugin.training.runs import checkpoints
-from visdom_plugin.training.selection import select_on_test
 
 CPU = torch.device("cpu")
 
@@ -40,6 +42,23 @@ def test_snapshots_are_the_states_on_the_way_and_change_nothing(train, tmp_path)
 def test_more_snapshots_than_steps_are_one_a_step(train, tmp_path):
     train(fake.FakeConfig(steps=3), snapshots=10)
     assert checkpoints.list_steps(tmp_path / "run" / "snapshots") == [1, 2, 3]
+
+
+@pytest.fixture
+def scene():
+    return fake.tiny_scene()
+
+
+@pytest.fixture
+def train(monkeypatch, tmp_path, scene):
+    """train(config, ...) of the fake method into tmp_path / "run"."""
+    monkeypatch.setattr(registry, "installed", fake.fake_registry)
+
+    def call(config=None, **keywords):
+        keywords = {"run_dir": tmp_path / "run", "quiet": True, "data_manager": fake.FakeManager} | keywords
+        return run.train(fake.NAME, config or fake.FakeConfig(), scene, **keywords)
+
+    return call
 
 
 @pytest.fixture

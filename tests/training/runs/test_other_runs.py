@@ -14,7 +14,7 @@ import pytest
 from tests.training.fake import FakeConfig, FakeInner, tiny_views
 from visdom_plugin.errors import CheckpointError
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.parametrize(
