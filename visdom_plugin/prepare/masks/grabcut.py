@@ -72,7 +72,7 @@ def enlarge(mask: np.ndarray, image: np.ndarray) -> np.ndarray:
     return cv2.ximgproc.guidedFilter(guide, soft, radius, _EPSILON) > 0.5
 
 
-def tidy(mask: np.ndarray, share: float = 0.02) -> np.ndarray:
+def tidy(mask: np.ndarray, share: float = 0.004) -> np.ndarray:
     """Without pieces and holes smaller than a share of the object's area."""
     import cv2
 

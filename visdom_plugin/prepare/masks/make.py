@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from datamodules.views.reader import map_on_cores
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.carve import carve_silhouettes
 from visdom_plugin.hull.carving.votes import gather_silhouettes
+from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.hull.settings import HullSettings
 from visdom_plugin.prepare.masks import plate
@@ -19,6 +21,7 @@ from visdom_plugin.prepare.masks.grabcut import (
     BACKGROUND,
     LIKELY_BACKGROUND,
     LIKELY_OBJECT,
+    OBJECT,
     cut,
     enlarge,
     shrink,
@@ -30,10 +33,24 @@ log = logging.getLogger(__name__)
 
 _SAME, _OTHER = 5.0, 14.0
 """Differences of colour, in Lab: up to the first a pixel shows the plane, from the second on something else."""
+_ROOM, _MARGIN = 0.15, 0.1
+"""Beside the object and beside its box, in sizes of it."""
 _RESOLUTION, _BAND = 128, 0.04
 """Of the hull that corrects masks, and its outline's leeway in object sizes."""
 _LEAST_SHARE = 1e-4
 """Of a photograph: less that differs from the plane is no object."""
+
+
+class _Copies(NamedTuple):
+    """Small copies of the parts of the views that show a box."""
+
+    windows: list[tuple[slice, slice]]
+    """Rows and columns of each part in its view."""
+    images: list[np.ndarray]
+    """(h, w, 3) uint8."""
+    cameras: Cameras
+    inside: list[np.ndarray]
+    """(h, w) bool, where a copy shows the box."""
 
 
 def cut_views(
@@ -54,23 +71,59 @@ def cut_views(
         plane: whether the box stands on a plane that the views show, as a board on a table.
         rounds: of correction by the hull.
     """
-    small = [shrink(image) for image in images]
-    heights, widths = zip(*(s.shape[:2] for s in small), strict=True)
-    less = cameras.resized(torch.tensor(widths), torch.tensor(heights))
-    inside = outline_of_box(less, box, list(names))
-    unlike = None
-    if plane and len(images) >= plate.LEAST_VIEWS:
-        unlike = plate.differences(less, small, box)
-    starts = [_start(inside[i], None if unlike is None else unlike[i]) for i in range(len(small))]
-    masks = _cut_all(small, starts)
-    for _ in range(rounds):
-        outlines = _outlines_of_hull(less, masks, box)
-        if outlines is None:
-            log.warning("the masks of the views have no hull in common; they are left as colours tell them")
-            break
-        corrected = [_correct(starts[i], masks[i], outlines[i]) for i in range(len(small))]
-        masks = _cut_all(small, corrected)
-    return map_on_cores(lambda i: tidy(enlarge(masks[i], images[i])), range(len(small)))
+    for last in (False, True):
+        copies = _copy(cameras, images, names, box)
+        unlike: Sequence[np.ndarray | None] = [None] * len(images)
+        if plane and len(images) >= plate.LEAST_VIEWS:
+            unlike = plate.differences(copies.cameras, copies.images, box)
+        starts = [_start(inside, other) for inside, other in zip(copies.inside, unlike, strict=True)]
+        masks = _cut_all(copies.images, starts)
+        for _ in range(rounds if last else 1):
+            hull = _carve(copies.cameras, masks, box)
+            if hull is None:
+                log.warning(
+                    "the masks of the views have no hull in common; they are left as colours tell them"
+                )
+                break
+            outlines = [depth_and_silhouette(hull, copies.cameras[i])[1].numpy() for i in range(len(masks))]
+            corrected = [_correct(*x) for x in zip(starts, masks, outlines, unlike, strict=True)]
+            masks = _cut_all(copies.images, corrected)
+        if not last:
+            if hull is None:
+                break
+            # Closer, where the object has been seen to be.
+            tight = np.asarray(hull.extent)
+            room = _ROOM * (tight[1] - tight[0]).max()
+            box = np.stack([np.maximum(box[0], tight[0] - room), np.minimum(box[1], tight[1] + room)])
+
+    def whole(i: int) -> np.ndarray:
+        mask = np.zeros(images[i].shape[:2], bool)
+        mask[copies.windows[i]] = tidy(enlarge(masks[i], images[i][copies.windows[i]]))
+        return mask
+
+    return map_on_cores(whole, range(len(images)))
+
+
+def _copy(cameras: Cameras, images: Sequence[np.ndarray], names: Sequence[str], box: np.ndarray) -> _Copies:
+    outlines = outline_of_box(cameras, box, list(names))
+    windows, parts, K = [], [], cameras.intrinsics.clone()
+    for i, outline in enumerate(outlines):
+        window = []
+        for axis in (1, 0):
+            there = np.flatnonzero(outline.any(axis))
+            room = round(_MARGIN * (there[-1] - there[0] + 1)) + 8
+            window.append(slice(max(0, there[0] - room), min(outline.shape[1 - axis], there[-1] + 1 + room)))
+        K[i, 0, 2] -= window[1].start
+        K[i, 1, 2] -= window[0].start
+        windows.append((window[0], window[1]))
+        parts.append(images[i][windows[i]])
+    small = [shrink(part) for part in parts]
+    sizes = torch.tensor(
+        [[[p.shape[1], p.shape[0]], [s.shape[1], s.shape[0]]] for p, s in zip(parts, small, strict=True)]
+    )
+    cropped = Cameras(K, cameras.world_from_camera, sizes[:, 0, 0], sizes[:, 0, 1])
+    less = cropped.resized(sizes[:, 1, 0], sizes[:, 1, 1])
+    return _Copies(windows, small, less, outline_of_box(less, box, list(names)))
 
 
 def _cut_all(images: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -89,38 +142,42 @@ def _start(inside: np.ndarray, unlike: np.ndarray | None) -> np.ndarray:
     if (other & inside).sum() < _LEAST_SHARE * inside.size:
         return labels
     # Where the plane is not seen, colours decide: they start as background, which most of it is.
-    labels[inside & ~other] = LIKELY_BACKGROUND
+    labels[inside] = LIKELY_BACKGROUND
+    labels[inside & other] = OBJECT
     # Far from anything that differs, the plane is seen: markers' colours teach the background.
     about = cv2.dilate(other.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     labels[inside & ~about & (np.nan_to_num(unlike, nan=np.inf) < _SAME)] = BACKGROUND
     return labels
 
 
-def _outlines_of_hull(
-    cameras: Cameras, masks: Sequence[np.ndarray], box: np.ndarray
-) -> list[np.ndarray] | None:
-    """What the views agree on, seen by each, N x (h, w) bool; None where they agree on nothing."""
+def _carve(cameras: Cameras, masks: Sequence[np.ndarray], box: np.ndarray) -> Hull | None:
+    """What all but a few views agree on; None where they agree on nothing."""
     views = len(masks)
-    misses = 0 if views < 5 else 1 if views < 10 else 2
-    corners = tuple(tuple(float(x) for x in corner) for corner in box)
+    low, high = (tuple(float(x) for x in corner) for corner in box)
     settings = HullSettings(
-        k=min(3, views), max_misses=misses, bounds=corners, resolution=_RESOLUTION, components="drop-small"  # type: ignore[arg-type]
-    )  # fmt: skip
-    hull = carve_silhouettes(settings, cameras, gather_silhouettes(cameras, list(masks), dilate_px=1))
-    if hull is None:
-        return None
-    return [depth_and_silhouette(hull, cameras[i])[1].numpy() for i in range(views)]
+        k=min(3, views),
+        max_misses=0 if views < 5 else 1 if views < 10 else 2,
+        bounds=((low[0], low[1], low[2]), (high[0], high[1], high[2])),
+        resolution=_RESOLUTION,
+        components="drop-small",
+    )
+    return carve_silhouettes(settings, cameras, gather_silhouettes(cameras, list(masks), dilate_px=1))
 
 
-def _correct(start: np.ndarray, mask: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """Labels for the next cut: nothing far outside the hull is object, what the others see of it likely is."""
+def _correct(
+    start: np.ndarray, mask: np.ndarray, outline: np.ndarray, unlike: np.ndarray | None
+) -> np.ndarray:
+    """Labels for the next cut: nothing far outside the hull is object; what differs from the plane and what the
+    others see of the hull likely is."""
     import cv2
 
     band = max(1, round(_BAND * np.sqrt(max(1, int(outline.sum())))))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band + 1, 2 * band + 1))
     far = cv2.dilate(outline.astype(np.uint8), kernel) == 0
-    labels = np.where(mask, LIKELY_OBJECT, LIKELY_BACKGROUND).astype(np.uint8)
     inner = cv2.erode(outline.astype(np.uint8), kernel) > 0
-    labels[inner] = LIKELY_OBJECT
+    labels = np.where(mask, LIKELY_OBJECT, LIKELY_BACKGROUND).astype(np.uint8)
+    if unlike is None:
+        labels[inner] = LIKELY_OBJECT
+    labels[start == OBJECT] = OBJECT
     labels[far | (start == BACKGROUND)] = BACKGROUND
     return labels

@@ -16,8 +16,8 @@ from visdom_plugin.geometry.cameras import Cameras
 
 LEAST_VIEWS = 4
 """Views needed: fewer do not outvote the object."""
-_MAP_PX = 640
-_REACH = 3.0
+_MAP_PX = 800
+_REACH = 4.0
 """Side of the map in longest sides of the box."""
 _MOST_VIEWS = 16
 _NEAR = 1e-3
