@@ -56,6 +56,7 @@ def place_by_board(
         [bent] * len(placed),
         "the printed board",
         "metres",
+        True,
         {v.name: v.reason for v in result.views if v.world_from_camera is None},
         {v.name: {"corners": v.corners, "reprojection_px": v.rms_px} for v in result.views},
         {

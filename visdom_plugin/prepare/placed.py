@@ -30,6 +30,8 @@ class Placed:
     source: str
     """Where the poses are from, for people."""
     units: str = "unknown"
+    on_board: bool = False
+    """Whether the world is the board's, the object above it."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Photographs without a camera, and why."""
     views: dict[str, dict[str, Any]] = field(default_factory=dict)

@@ -24,6 +24,8 @@ from visdom_plugin.export.dataset import write_transforms
 from visdom_plugin.figures.contact_sheet import write_png
 from visdom_plugin.geometry.cameras import Cameras
 
+_CAMERA_FILES = (".bin", ".txt", ".json", ".xml", ".csv", ".xmp", ".npz", ".npy")
+_MOST_FILES = 5000
 RECORD, SHEET = "prepare.json", "prepare.png"
 
 
@@ -80,6 +82,14 @@ def as_plain(value: Any) -> Any:
 def hash_file(path: Path) -> str:
     """SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def hash_files(path: Path) -> dict[str, str]:
+    """SHA-256 of a file, or of the files of cameras in a folder, by their name."""
+    if path.is_file():
+        return {path.name: hash_file(path)}
+    files = sorted(p for p in path.rglob("*") if p.suffix.lower() in _CAMERA_FILES and p.is_file())
+    return {p.relative_to(path).as_posix(): hash_file(p) for p in files[:_MOST_FILES]}
 
 
 @contextmanager

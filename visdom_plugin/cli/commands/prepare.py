@@ -35,6 +35,10 @@ class Options(BoardSettings):
     """Write the board as PDF at true size, and nothing else."""
     paper: Literal["a4", "letter", "a3", "tabloid"] = "a4"
     """Paper to print the board on."""
+    poses: Path | None = None
+    """Poses of another program, in place of a board's: a COLMAP model, transforms.json, Metashape's XML,
+    RealityScan's CSV or XMP, Record3D, Polycam, 3D Scanner App, VGGT, pi3, DUSt3R. board: those of the board, even
+    where PHOTOS has others."""
     focal_35mm: float | None = None
     """Focal length as its 35 mm equivalent, where the files have no EXIF data and the views do not tell it."""
     masks: str | None = None
@@ -90,14 +94,15 @@ def _main(argv: Sequence[str]) -> None:
         options.rembg_model,
     )
     plan = Plan(
-        options.photographs,
-        out,
-        options.size,
-        options.masks,
-        options.focal_35mm,
-        options.overwrite,
-        board,
-        masks,
+        photographs=options.photographs,
+        out=out,
+        size=options.size,
+        masks_folder=options.masks,
+        poses=options.poses,
+        focal_35mm=options.focal_35mm,
+        overwrite=options.overwrite,
+        board=board,
+        masks=masks,
     )
     made = prepare(plan)
     if options.json:
