@@ -65,6 +65,8 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None, *, test: bo
         CheckpointError: when what is found there is not what the run was trained on, or measured on.
         SceneError: when it cannot be read.
     """
+    from visdom_plugin import registry
+    from visdom_plugin.training.run import add_points
     from visdom_plugin.training.runs.run_directory import hash_views
 
     noted = record["data"]
@@ -74,6 +76,7 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None, *, test: bo
             f"the run's scene is not at {path} any more", where=run, todo="say where it is with --data DIR"
         )
     scene = _open_noted(path, noted, run, test)
+    scene = add_points(scene, registry.find(record["method"]), record["config"].get("hull"))
     parts = [("train_views", scene.train, "trained")] + [("test_views", scene.test, "measured")] * test
     for name, views, used in parts:
         if hash_views(views) != noted["hashes"][name]:

@@ -57,6 +57,13 @@ class Interrupted(KeyboardInterrupt):
     """A signal stopped the run; the same command resumes it from the last step saved."""
 
 
+def add_points(scene: Scene, preset: registry.Preset, hull: object) -> Scene:
+    """The scene with its points among the training views where training starts from them: Gaussians, no `hull`."""
+    if preset.hook != "gaussian" or hull is not None:
+        return scene
+    return replace(scene, train=replace(scene.train, points=scene.points))
+
+
 def train(
     preset_name: str,
     config: Settings,
@@ -102,8 +109,7 @@ def train(
     board = None if tensorboard is None else TensorBoard(tensorboard)
     preset = registry.find(preset_name)
     device = torch.device(device)
-    if preset.hook == "gaussian" and getattr(config, "hull", None) is None:
-        scene = replace(scene, train=replace(scene.train, points=scene.points))
+    scene = add_points(scene, preset, getattr(config, "hull", None))
     identity = {
         "method": preset.name,
         "scene": scene.name,

@@ -20,6 +20,7 @@ from visdom_plugin.cli import runs
 from visdom_plugin.cli.commands import evaluate, render, train
 from visdom_plugin.errors import CheckpointError
 from visdom_plugin.scene import hold_out
+from visdom_plugin.training.run import add_points
 from visdom_plugin.training.runs.run_directory import describe_data
 
 free, plain = layouts.free, layouts.plain
@@ -134,13 +135,27 @@ def test_every_layout_gives_the_noted_views_again(name, held_out, free, plain, t
     if held_out:
         scene = hold_out(scene, 2)
     noted = describe_data(scene, {"path": str(path), **asked})
-    again = runs.load_again({"data": json.loads(json.dumps(noted))}, tmp_path, None)
+    record = {"method": "3dgs-go", "config": {"hull": {}}}
+    again = runs.load_again({**record, "data": json.loads(json.dumps(noted))}, tmp_path, None)
     for part in ("train", "test"):
         assert list(getattr(again, part).names) == noted[part] and (noted[part] or part == "test")
     if noted["test"]:
         noted["test"] = noted["test"][1:] or [noted["train"].pop()]
         with pytest.raises(CheckpointError, match="is not the one this run was"):
-            runs.load_again({"data": noted}, tmp_path, None)
+            runs.load_again({**record, "data": noted}, tmp_path, None)
+
+
+def test_runs_that_started_from_the_scenes_points_are_opened_again(tmp_path):
+    folder = write(tmp_path / "somewhere")
+    cloud = folder / "sparse/0/points3D.txt"
+    cloud.write_text("1 0 0 0.1 9 9 9 0.5\n2 0 0.1 0 9 9 9 0.5\n")
+    record = {"method": "3dgs-go", "config": {"hull": None}}
+    scene = add_points(load(folder), registry.find(record["method"]), None)
+    record["data"] = describe_data(scene, {"path": str(folder), "views": 4, "downscale": 1, "seed": 0})
+    assert len(runs.load_again(record, tmp_path, None).train.points[0]) == 2
+    cloud.write_text("1 0 0 0.1 9 9 9 0.5\n")
+    with pytest.raises(CheckpointError, match="is not the one this run was trained on"):
+        runs.load_again(record, tmp_path, None)
 
 
 def test_a_single_view_and_names_with_commas(folder, capsys):
