@@ -19,6 +19,8 @@ MOST_ENLARGED = 10
 """A mask more than this many times wider than its image is refused before it is decoded."""
 MOST_LABELS, LARGEST_LABEL = 32, 63
 """An image of more, or larger, grey values is no label image but a soft mask."""
+_VOID = 255
+_SOLID = 0.25
 _NEARLY_FULL = 0.93
 _COLOURFUL = 16  # of 255, between a colour's channels: less comes of reducing a grey picture to a palette
 _SOFT = (0.02, 0.98)
@@ -34,6 +36,8 @@ class Mask(NamedTuple):
     """Share of the pixels that are neither black nor white."""
     labelled: bool = False
     """Whether the file's values are numbers of objects: 0 is background, all others are object."""
+    unknown: np.ndarray | None = None
+    """(H, W) bool, True where the file says that nothing is known; None where it never does."""
 
 
 def fits(size: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -52,8 +56,8 @@ def fits(size: tuple[int, int], other: tuple[int, int]) -> bool:
 def decode_mask(data: bytes, path: Path) -> Mask:
     """A foreground mask from L, LA, RGB, RGBA, palette, 1-bit, 8-bit or 16-bit PNG or JPEG.
 
-    Its alpha channel is the mask where it varies; else a label image is object where its value is not 0; else
-    its brightest colour channel is the mask.
+    Its alpha channel is the mask where it varies; else a label image is object where its value is not 0, and
+    unknown at its value for void, 255; else its brightest colour channel is the mask.
 
     Raises:
         SceneError: two readings are possible, and they disagree.
@@ -65,7 +69,12 @@ def decode_mask(data: bytes, path: Path) -> Mask:
     colour = colour.astype(np.float32) / full
     if alpha is None:
         labels = _find_labels(data, path, pixels)
-        return _measured(colour) if labels is None else Mask((labels > 0).astype(np.float32), 0.0, True)
+        if labels is not None:
+            numbers, void = labels
+            unknown = None if void is None else numbers == void
+            known = numbers > 0 if unknown is None else (numbers > 0) & ~unknown
+            return Mask(known.astype(np.float32), 0.0, True, unknown)
+        return _measured(colour)
     alpha = alpha.astype(np.float32) / full
     # A cut-out's colours are a photograph; only colours that are black and white could be meant as a mask.
     if colour.min() != colour.max() and soft_share(colour) < _AGREED and _differ(colour, alpha):
@@ -78,10 +87,11 @@ def decode_mask(data: bytes, path: Path) -> Mask:
     return _measured(alpha)
 
 
-def _find_labels(data: bytes, path: Path, pixels: np.ndarray) -> np.ndarray | None:
-    """(H, W) numbers of objects where the file is a label image, else None.
+def _find_labels(data: bytes, path: Path, pixels: np.ndarray) -> tuple[np.ndarray, int | None] | None:
+    """(H, W) numbers of objects where the file is a label image, and the number for what is unknown; else None.
 
-    That is a palette in colours, or a few small grey values with 0 among them, in a format without loss.
+    That is a palette in colours, or a few small grey values with 0 among them, in a format without loss. Beside
+    such, 255 is void; so is the grey in the middle of a trimap, of which 255 is the object.
     """
     if (paletted := images.decode_palette(data, path)) is not None:
         indices, palette = paletted
@@ -95,13 +105,47 @@ def _find_labels(data: bytes, path: Path, pixels: np.ndarray) -> np.ndarray | No
                     cause="a picture reduced to a palette, whose order says nothing",
                     todo="save the mask as a grey image with 0 and 255",
                 )
-            return indices
+            labels = used[(used > 0) & (used <= LARGEST_LABEL)]
+            return indices, _VOID if used[-1] == _VOID and 0 < len(labels) >= len(used) - 2 else None
     if pixels.ndim == 3 and (pixels.shape[2] < 3 or (pixels[..., :1] != pixels[..., :3]).any()):
         return None
     grey = pixels if pixels.ndim == 2 else pixels[..., 0]
-    if grey.max() > LARGEST_LABEL or grey.max() == 0 or grey.min() > 0 or not images.is_lossless(data, path):
+    if grey.min() > 0 or not images.is_lossless(data, path):
         return None
-    return grey if len(np.unique(grey)) <= MOST_LABELS else None
+    values = np.unique(grey)
+    if len(values) == 3 and values[1] in (127, 128) and values[2] == _VOID:
+        return grey, int(values[1])
+    if not 1 < len(values) <= MOST_LABELS + 1:
+        return None
+    if values[-1] <= LARGEST_LABEL:
+        return (grey, None) if len(values) <= MOST_LABELS else None
+    if values[-1] not in (_VOID, np.iinfo(grey.dtype).max) or not 0 < values[-2] <= LARGEST_LABEL:
+        return None
+    # Numbers fill areas; what a scan or a resampling leaves beside black does not.
+    if _solid_share(grey, (grey > 0) & (grey < values[-1])) < _SOLID:
+        return None
+    if _solid_share(grey, grey == values[-1]) > _SOLID:
+        raise SceneError(
+            f"the mask holds small numbers up to {values[-2]}, as label images do, and wide areas of "
+            f"{values[-1]}: these could be the object, or what a label image leaves open",
+            where=path,
+            cause="a label image whose void value covers more than outlines, or a mask with marks in the dark",
+            todo="save masks with 0 and 255 alone; what is unknown goes into a file of the same name in the "
+            "folder ignore, white where nothing is known",
+        )
+    return grey, int(values[-1])
+
+
+def _solid_share(grey: np.ndarray, part: np.ndarray) -> float:
+    """Share of a part's pixels that have the value of all within two pixels: little of outlines, most of areas."""
+    import cv2
+
+    size = np.ones((5, 5), np.uint8)
+    ends = (
+        move(grey, size, borderType=cv2.BORDER_CONSTANT, borderValue=0) for move in (cv2.erode, cv2.dilate)
+    )
+    flat = np.equal(*ends)
+    return float((flat & part).sum() / max(part.sum(), 1))
 
 
 def decode_alpha(pixels: np.ndarray) -> Mask | None:

@@ -25,7 +25,7 @@ from visdom_plugin.errors import SceneError
 _T = TypeVar("_T")
 _LOOKED_AT = 6
 """Views whose pixels decide whether masks are turned."""
-_VERSION = 2
+_VERSION = 3
 """Raised when other pixels are made of the same files."""
 
 
@@ -71,13 +71,14 @@ class ViewReader:
     def _read(self, i: int) -> LoadedView:
         reading, file, full, distortion = self._reading, self._files[i], self._full[i], self._distortions[i]
         photo = open_photograph(reading, file, full)
-        opacity, mask_path, remarks = side_files.read_mask(reading, file, photo, self._choose_turns)
+        found = side_files.read_mask(reading, file, photo, self._choose_turns)
+        opacity, mask_path = found.opacity, found.path
         masked = opacity is not None
         if not masked and not reading.request.allow_missing_masks:
             side_files.refuse_unmasked(reading, file, photo)
         soft = np.ones((1, 1), np.float32) if opacity is None else opacity
         image = photo.decode()
-        unknown = side_files.read_ignored(reading, file, photo, self._choose_turns)
+        unknown = side_files.read_ignored(reading, file, photo, found, self._choose_turns)
         if distortion is not None:
             scaled = self._K[i] * np.array([[photo.size[0] / full[0]], [photo.size[1] / full[1]], [1.0]])
             soft = side_files.resize(soft, *photo.size)
@@ -104,7 +105,7 @@ class ViewReader:
             depth=side_files.read_depth(reading, file, full, photo.target),
             masked=masked,
             soft=masks.soft_share(soft) if masked else 0.0,
-            remarks=(*photo.remarks, *remarks),
+            remarks=(*photo.remarks, *found.remarks),
         )
 
     def _inspect(self, i: int) -> InspectedView:
@@ -121,10 +122,10 @@ class ViewReader:
             if relative is not None and (other := reading.find(relative)).is_file():
                 state.update(hashlib.sha256(read_file(other)).digest())
         missing_allowed = reading.request.allow_missing_masks
-        masked = photo.alpha and reading.request.mask_source != "folder"
+        void, masked = False, photo.alpha and reading.request.mask_source != "folder"
         if file.mask is not None or (masked and missing_allowed):
-            soft, mask_path, _ = side_files.read_mask(reading, file, photo, lambda: (0, False))
-            masked = soft is not None
+            soft, unknown, mask_path, _ = side_files.read_mask(reading, file, photo, lambda: (0, False))
+            masked, void = soft is not None, unknown is not None
             if soft is not None:
                 mask = side_files.resize(soft, *photo.target) > 0.5
                 masks.refuse_empty(mask, float(soft.max()), mask_path)
@@ -136,7 +137,7 @@ class ViewReader:
         return InspectedView(
             size=photo.target,
             masked=masked,
-            ignoring=file.ignore is not None or file.excluded is not None,
+            ignoring=void or file.ignore is not None or file.excluded is not None,
             deep=file.depth is not None and reading.find(file.depth).is_file(),
             fingerprint=state.hexdigest(),
         )

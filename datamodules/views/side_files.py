@@ -23,42 +23,51 @@ ChooseTurns = Callable[[], tuple[int, bool]]
 """For files that fit their photograph turned and not: which way most do, and whether that is clear."""
 
 
-def read_mask(
-    reading: Reading, file: Frame, photo: Photograph, choose_turns: ChooseTurns
-) -> tuple[np.ndarray | None, Path, tuple[str, ...]]:
-    """(H, W) float32 opacity at the file's own size, the file, and remarks; None where there is no mask."""
-    opacity, path, remarks = _find_mask(reading, file, photo, choose_turns)
-    if opacity is not None and reading.request.invert_masks:
-        opacity = 1 - opacity
-    return opacity, path, remarks
+class FoundMask(NamedTuple):
+    """A view's mask in its photograph's frame, at the file's own size."""
+
+    opacity: np.ndarray | None
+    """(H, W) float32; None where there is no mask."""
+    unknown: np.ndarray | None
+    """(H, W) bool, True where the mask's file says that nothing is known; None where it never does."""
+    path: Path
+    remarks: tuple[str, ...] = ()
+    """How it was understood, where that is not plain."""
 
 
-def _find_mask(
-    reading: Reading, file: Frame, photo: Photograph, choose_turns: ChooseTurns
-) -> tuple[np.ndarray | None, Path, tuple[str, ...]]:
+def read_mask(reading: Reading, file: Frame, photo: Photograph, choose_turns: ChooseTurns) -> FoundMask:
+    """The mask of a view, from its file or the photograph's alpha channel, turned over where that is asked for."""
+    found = _find_mask(reading, file, photo, choose_turns)
+    if found.opacity is not None and reading.request.invert_masks:
+        return found._replace(opacity=1 - found.opacity)
+    return found
+
+
+def _find_mask(reading: Reading, file: Frame, photo: Photograph, choose_turns: ChooseTurns) -> FoundMask:
     source, alpha = reading.request.mask_source, None
     if photo.alpha and source != "folder":
         alpha = masks.decode_alpha(images.decode_any(photo.data, photo.path))
         alpha = alpha and alpha._replace(opacity=photo.turn(alpha.opacity))
     if source == "alpha" or (file.mask is None and source != "folder"):
-        return (None if alpha is None else alpha.opacity), photo.path, ()
+        return FoundMask(None if alpha is None else alpha.opacity, None, photo.path)
     if file.mask is None:
-        return None, photo.path, ()
+        return FoundMask(None, None, photo.path)
     found, path, remarks = _read_turned(reading, file.mask, photo, "mask", choose_turns)
     if alpha is not None:
         masks.refuse_two(found, alpha, path, photo.path)
-    return found.opacity, path, remarks
+    return FoundMask(found.opacity, found.unknown, path, remarks)
 
 
 def read_ignored(
-    reading: Reading, file: Frame, photo: Photograph, choose_turns: ChooseTurns
+    reading: Reading, file: Frame, photo: Photograph, mask: FoundMask, choose_turns: ChooseTurns
 ) -> np.ndarray | None:
     """(H, W) bool at the photograph's size, True where nothing is known; None where everything is."""
-    ignore = None
+    ignore = None if mask.unknown is None else resize(mask.unknown.astype(np.float32), *photo.size) > 0
     for relative, black_is_unknown in ((file.ignore, True), (file.excluded, False)):
         if relative is not None:
-            values = _read_turned(reading, relative, photo, "mask of ignored pixels", choose_turns)[0].opacity
-            unknown = values <= 0.5 if black_is_unknown else values > 0
+            found = _read_turned(reading, relative, photo, "mask of ignored pixels", choose_turns)[0]
+            unknown = found.opacity <= 0.5 if black_is_unknown else found.opacity > 0
+            unknown = unknown if found.unknown is None else unknown | found.unknown
             unknown = resize(unknown.astype(np.float32), *photo.size) > 0
             ignore = unknown if ignore is None else ignore | unknown
     return ignore if ignore is not None and ignore.any() else None
@@ -207,5 +216,8 @@ def _read_turned(
         remarks.append(f"masks turned by their EXIF orientation {turns[0]}")
     found = masks.decode_mask(other.data, other.path)
     if found.labelled:
-        remarks.append("label images read as masks: 0 is background, every other value is object")
-    return found._replace(opacity=orientation.apply(found.opacity, turns)), other.path, tuple(remarks)
+        void = "" if found.unknown is None else "; their value for void is unknown, as in ignore/"
+        remarks.append(f"label images read as masks: 0 is background, every other value is object{void}")
+    unknown = None if found.unknown is None else orientation.apply(found.unknown, turns)
+    turned = found._replace(opacity=orientation.apply(found.opacity, turns), unknown=unknown)
+    return turned, other.path, tuple(remarks)

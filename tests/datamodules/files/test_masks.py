@@ -166,6 +166,40 @@ def test_label_images_are_object_where_they_are_not_0(make):
     assert np.array_equal(mask.opacity, TRUTH.astype(np.float32))
 
 
+OUTLINED = np.zeros((40, 50), np.uint8)
+cv2.rectangle(OUTLINED, (8, 8), (34, 30), 2, -1)
+cv2.rectangle(OUTLINED, (20, 8), (34, 30), 15, -1)
+cv2.rectangle(OUTLINED, (8, 8), (34, 30), 255, 2)
+VOC = [[0, 0, 0]] + [[64, 0, 0]] * 254 + [[224, 224, 192]]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: _cv(OUTLINED),
+        lambda: _cv(np.dstack([OUTLINED] * 3)),
+        lambda: _cv(OUTLINED.astype(np.uint16)),
+        lambda: _cv(np.where(OUTLINED == 255, 65535, OUTLINED).astype(np.uint16)),
+        lambda: _coloured(OUTLINED, VOC),
+        lambda: _cv(np.uint8([0, 255, 128])[np.where(OUTLINED == 255, 2, OUTLINED > 0)]),
+    ],
+    ids=["grey", "RGB", "16 bit", "16 bit, 65535", "palette of Pascal VOC", "trimap"],
+)
+def test_void_in_label_images_is_unknown(make):
+    mask = masks.decode_mask(make(), "mask.png")
+    assert mask.labelled and np.array_equal(mask.unknown, OUTLINED == 255)
+    assert np.array_equal(mask.opacity > 0.5, (OUTLINED > 0) & (OUTLINED < 255))
+
+
+def test_void_that_could_be_the_object_is_refused():
+    wide = OUTLINED.copy()
+    wide[:, 38:] = 255
+    with pytest.raises(SceneError, match=r"wide areas of 255[\s\S]*0 and 255 alone[\s\S]*ignore"):
+        masks.decode_mask(_cv(wide), "mask.png")
+    alone = masks.decode_mask(_coloured(np.where(OUTLINED > 0, 255, 0), VOC), "mask.png")
+    assert alone.unknown is None and np.array_equal(alone.opacity > 0.5, OUTLINED > 0)
+
+
 def test_what_is_no_label_image_is_read_by_its_brightness():
     soft = cv2.GaussianBlur(GREY, (0, 0), 1)
     dark = np.linspace(0, 60, 12 * 17).reshape(12, 17).astype(np.uint8)

@@ -75,6 +75,20 @@ def test_label_images_are_read_and_said(tiny, folder):
     assert said in scene.notes
 
 
+def test_void_of_label_images_is_ignored_in_every_view(tiny, folder):
+    for views in (tiny.train, tiny.test):
+        for mask, name in zip(views.masks, views.names, strict=True):
+            labels = mask.numpy() * np.uint8(7)
+            labels[:3] = 255
+            write(folder / f"masks/{name}.png", labels)
+    scene = load(folder)
+    assert any("their value for void is unknown, as in ignore/" in note for note in scene.notes)
+    for ours, theirs in ((scene.train, tiny.train), (scene.test, tiny.test)):
+        for i, mask in enumerate(theirs.masks):
+            assert ours.ignored(i)[:3].all() and not ours.ignored(i)[3:].any()
+            assert torch.equal(ours.masks[i][3:], mask[3:])
+
+
 def test_the_alpha_channel_is_the_mask_where_there_is_no_other(tiny, folder):
     add_alpha(folder, truth(tiny))
     empty(folder / "masks")
