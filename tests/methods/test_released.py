@@ -1,6 +1,7 @@
 """The authors' recipe as presets: what they set, and the settings of ours that exist for them."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from method_configs import gs_go, zipnerf_lite
 from tests.methods.fields.test_nerf_methods import HULL, SMALL, start
 from visdom_plugin import registry
 from visdom_plugin.cli import options
+from visdom_plugin.cli.commands import table
 from visdom_plugin.cli.runs import default_run_dir
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hull.domain import VisibleDomain
@@ -26,6 +28,30 @@ def test_the_command_line_takes_them_literally(name):
     request = options.parse([f"method:{name}", "--budget", "full"])
     assert request.preset is registry.find(name) and request.config == request.preset.full
     assert ":" not in str(default_run_dir("scene", 4, name, 0))
+
+
+def test_tables_take_them_literally(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rows = "".join(f"  - {{label: row {i}, method: {name}}}\n" for i, name in enumerate(NAMES))
+    parts = ("k", "agreement", "resolution", "components", "bounds_scale", "bounds_capture_radii")
+    varies = f"[{', '.join('hull.' + part for part in parts)}]"
+    Path("t.yaml").write_text(
+        f"title: T\nmetrics: [psnr]\nvaries: {varies}\nrows:\n{rows}columns: [{{label: c}}]\n"
+    )
+    assert table.main(["t.yaml", "--dry-run"]) == 0
+    shown = capsys.readouterr().out
+    assert "3 jobs, 3 runs" in shown
+    assert not any(":" in line.split("  ")[-1] for line in shown.splitlines() if line.startswith("run "))
+
+
+def test_a_hull_for_the_loss_alone_can_be_given_to_any_preset(tmp_path):
+    file = tmp_path / "own.yaml"
+    file.write_text("method: 3dgs-go+vd\nsettings: {vd: {loss_hull: {k: 2}}}\n")
+    config = options.parse(["--config", str(file)]).config
+    assert config.vd.loss_hull == VisibleDomain(k=2)
+    assert config == replace(
+        config, vd=replace(gs_go.SPEC.presets()["3dgs-go+vd"].quick.vd, loss_hull=VisibleDomain(k=2))
+    )
 
 
 def test_splats_have_what_the_release_sets():
@@ -89,9 +115,11 @@ def test_proposals_may_follow_the_masks(scene, hull):  # noqa: F811
     shared._see = lambda *a: seen.append(look(*a)) or seen[-1]
     losses = [float(m.train_step(batch, 0).losses["mask"].detach()) for m in (plain, clamped, shared)]
     alphas = [level.weights.sum(-1) for level in seen[0][0]]
-    parts = [float(mask_loss(a, batch.mask)) for a in alphas]
+    parts = [float(mask_loss(a.detach(), batch.mask)) for a in alphas]
     assert losses[0] == pytest.approx(0.1 * parts[2], rel=1e-5)
-    assert losses[1] == pytest.approx(0.1 * float(mask_loss(alphas[2], batch.mask, clamp=0.2)), rel=1e-5)
+    assert losses[1] == pytest.approx(
+        0.1 * float(mask_loss(alphas[2].detach(), batch.mask, clamp=0.2)), rel=1e-5
+    )
     assert losses[2] == pytest.approx(0.1 * (0.5 * parts[0] + 0.5 * parts[1] + parts[2]), rel=1e-5)
 
 

@@ -115,6 +115,7 @@ def test_the_commands_keep_and_choose_and_say_what_it_is(train, tmp_path, monkey
     assert command.main(["here", "--oracle"]) == 0
     shown = capsys.readouterr().out
     assert "SELECTED ON THE TEST SET, the best of 2 snapshots: not a result" in shown
+    assert command.main(["here", "--oracle", "--quiet"]) == 0 and capsys.readouterr().out == ""
     after = json.loads(Path("here/run.json").read_text())
     assert after["metrics"]["test"] == before and after["selected_on_test"]["step"] in (20, 40)
     assert train_command.main(["method:fake", "--out", "other", "--snapshots", "-1"]) == 2

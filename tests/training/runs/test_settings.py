@@ -73,6 +73,21 @@ def test_two_configs_differ_exactly_where_a_field_differs(a, b):
         assert (name in named) == (getattr(a, name) != getattr(b, name))
 
 
+@dataclass(frozen=True)
+class Maybe:
+    inner: Inner | None = None
+    rate: float | None = None
+
+
+def test_a_part_that_is_off_can_be_given_piece_by_piece():
+    assert from_plain(Maybe(), {"inner": {"k": 7}}, "f.yaml") == Maybe(inner=Inner(k=7))
+    assert from_plain(Maybe(inner=Inner(k=1)), {"inner": None}, "f.yaml") == Maybe()
+    with pytest.raises(ConfigError, match=r"unknown setting 'inner\.kk'"):
+        from_plain(Maybe(), {"inner": {"kk": 7}}, "f.yaml")
+    with pytest.raises(ConfigError, match="rate cannot be"):
+        from_plain(Maybe(), {"rate": {"k": 7}}, "f.yaml")
+
+
 def test_fields_left_out_keep_the_templates_values():
     template = Outer(rate=0.5, inner=Inner(k="auto"))
     read = from_plain(template, yaml.safe_load("inner: {pair: [1, 2]}\nrate: 1e-4"), "f")

@@ -64,8 +64,8 @@ def _evaluate(argv: Sequence[str]) -> int:
         record = select_on_test(method, scene.test, device=device, run_dir=options.run)
     if not quiet:
         show_result(record, options.run)
-    if options.oracle:
-        show_oracle(record)
+        if options.oracle:
+            show_oracle(record)
     return 0
 
 

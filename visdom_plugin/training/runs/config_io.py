@@ -50,6 +50,8 @@ def from_plain(template: T, plain: Any, where: str, path: str = "") -> T:
                 f"unknown setting {full!r}", name, valid, where=where, todo=f"valid names at {label}"
             )
         current = getattr(template, name)
+        if current is None and isinstance(value, dict):
+            current = _blank(hints[name])
         if is_dataclass(current) and isinstance(value, dict):
             changes[name] = from_plain(current, value, where, full)
             continue
@@ -111,6 +113,11 @@ _ABSENT = _Absent()
 def _short(value: Any) -> str:
     text = value if isinstance(value, str) else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _blank(hint: Any) -> Any:
+    """What a setting that is None is when given in parts: the defaults of its dataclass; None without one."""
+    return next((arm() for arm in get_args(hint) if is_dataclass(arm) and isinstance(arm, type)), None)
 
 
 def _coerce(value: Any, hint: Any) -> tuple[bool, Any]:
