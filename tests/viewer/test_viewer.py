@@ -14,9 +14,12 @@ from tests.splat.twin import make_gaussians
 from visdom_plugin.cli.commands import train, view
 from visdom_plugin.cli.subject import PointCloud
 from visdom_plugin.errors import ConfigError, PluginError
+from visdom_plugin.geometry.path_files import read_path
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.render import Render
 from visdom_plugin.splat.rasterise import rasterise
 from visdom_plugin.training.runs import checkpoints
+from visdom_plugin.viewer.drawing import SIDE_BY_SIDE, UNDER_SLIDER, Look, draw
 from visdom_plugin.viewer.serve import choose_port, describe_address
 from visdom_plugin.viewer.shown import (
     Reconstruction,
@@ -198,6 +201,71 @@ def test_the_rendered_picture_is_the_methods_own(viewer, subject):
     assert viewer.draw(Browser, width)[0, 0].max() == 0 and drawn[0, 0].min() == 255
     viewer.controls["error"].value = True
     assert viewer.draw(Browser, width).shape == drawn.shape
+
+
+class View:
+    """A browser's camera, looking as a training view does."""
+
+    def __init__(self, camera, middle, aspect=1.6):
+        pose = pose_of(camera, middle)
+        self.wxyz, self.position, self.aspect = pose["wxyz"], pose["position"], aspect
+        self.fov = 2 * float(torch.atan(camera.height / 2 / camera.intrinsics[1, 1]))
+
+
+class Plain:
+    """Draws a picture whose red is the column of each pixel from the middle, and whose blue is its own."""
+
+    def __init__(self, blue):
+        self.blue = blue
+
+    def render(self, camera, background):
+        width, height = int(camera.width), int(camera.height)
+        ahead = (torch.arange(width) + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0]
+        rgb = torch.full((height, width, 3), self.blue)
+        rgb[..., 0] = (ahead + 0.5).clamp(0, 1)
+        return Render(rgb, torch.ones(height, width), torch.ones(height, width))
+
+
+def test_two_runs_stand_side_by_side_at_the_same_scale(subject):
+    runs = tuple(replace(subject.runs[0], renderer=Plain(blue)) for blue in (0.2, 0.8))
+    both, middle = replace(subject, runs=runs), np.zeros(3)
+    view = View(subject.scene.train.cameras[0], middle)
+    alone, _ = draw(both, view, 200, middle, Look(1))
+    pair, said = draw(both, view, 200, middle, Look(comparison=SIDE_BY_SIDE))
+    assert pair.shape == alone.shape == (125, 200, 3) and said is None
+    assert pair[0, 40, 2] == 51 and pair[0, 160, 2] == 204 and alone[0, 40, 2] == 204
+    # Each shows the middle half of what one alone shows.
+    assert np.allclose(pair[0, 5:95, 0], alone[0, 55:145, 0], atol=1)
+    assert np.allclose(pair[0, 105:195, 0], alone[0, 55:145, 0], atol=1)
+    slid, _ = draw(both, view, 200, middle, Look(comparison=UNDER_SLIDER, share=0.25))
+    assert slid[0, 40, 2] == 51 and slid[0, 60, 2] == 204
+    assert np.allclose(slid[0, 60:, 0], alone[0, 60:, 0], atol=1)
+
+
+def test_the_error_is_as_large_as_fits_and_not_stretched(subject):
+    camera = subject.scene.train.cameras[1]
+    view = View(camera, np.zeros(3), aspect=3.0)
+    picture, said = draw(subject, view, 300, np.zeros(3), Look(error=True))
+    assert picture.shape == (100, 300, 3) and said == f"error against {subject.scene.train.names[1]}"
+    width = round(100 * int(camera.width) / int(camera.height))
+    beside = (300 - width) // 2
+    assert (picture[:, : beside - 1] == 48).all() and (picture[:, beside + 2 : -beside - 2] != 48).any()
+
+
+def test_a_path_of_views_is_saved_for_rendering(viewer, subject, tmp_path):
+    path = viewer.path
+    path.file = tmp_path / "way.json"
+    path.save()
+    assert "no views yet" in path.said.content and not path.file.exists()
+    for i in (0, 1, 2):
+        path.add(View(subject.scene.train.cameras[i], viewer.middle))
+    path.remove()
+    path.save()
+    assert "--path" in path.said.content and "2 views" in path.said.content
+    back, fps = read_path(path.file, subject.scene.train.cameras)
+    wanted = subject.scene.train.cameras[:2]
+    assert torch.allclose(back.world_from_camera, wanted.world_from_camera.double(), atol=1e-6) and fps == 30
+    assert (int(back.width[0]), int(back.height[0])) == (1152, 720)
 
 
 @browser.needed

@@ -17,16 +17,18 @@ import numpy as np
 import torch
 
 from visdom_plugin.errors import PluginError
-from visdom_plugin.figures.contact_sheet import draw_error, to_bytes
 from visdom_plugin.geometry.camera_paths import capture_up
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
-from visdom_plugin.training.evaluate import draw_truth
-from visdom_plugin.viewer.shown import Subject, camera_from, nearest_view, pose_of, splat_arrays
+from visdom_plugin.viewer.drawing import COMPARISONS, SIDE_BY_SIDE, UNDER_SLIDER, Look, draw
+from visdom_plugin.viewer.path_controls import PathControls
+from visdom_plugin.viewer.shown import Subject, pose_of, splat_arrays
 
 log = logging.getLogger(__name__)
 
-WIDTHS = (120, 240, 480)
+WIDTHS = (120, 240, 480, 960)
 """Widths of the rendered picture, one after the other."""
+_PATIENCE = 1.0
+"""Seconds that a picture may have taken for the next one, of four times the pixels, to be drawn."""
 _REST, _LOOK = 0.25, 2.0
 """Seconds for which the camera must be still, and between two looks for a newer state of a run."""
 _BACKGROUNDS = {"white": 1.0, "grey": 0.5, "black": 0.0}
@@ -66,6 +68,7 @@ class Viewer:
         self.controls: dict[str, Any] = {}
         self.moved: dict[int, float] = {}
         self.drawn: dict[int, tuple[float, int]] = {}
+        self._pictured: set[int] = set()
         self._done = threading.Event()
         self._lock = threading.RLock()
         self._add_controls()
@@ -113,24 +116,41 @@ class Viewer:
             controls["error"] = gui.add_checkbox("Error, nearest photo", False, disabled=none)
             labels = tuple(run.label for run in subject.runs)
             if len(labels) > 1:
-                controls["run"] = gui.add_dropdown("Run", labels)
-                controls["split"] = gui.add_slider("Left run's share", 0, 100, 1, 100)
+                controls["compare"] = gui.add_dropdown("Compare", COMPARISONS)
+                controls["split"] = gui.add_slider("Left run's share", 0, 100, 1, 50, visible=False)
+                controls["run"] = gui.add_dropdown("Run", labels, visible=False)
+                gui.add_markdown(f"left: **{labels[0]}**, right: **{labels[1]}**")
             controls["state"] = gui.add_markdown("")
+        self.path = PathControls(gui, subject.path_file, self.middle, subject.path)
         for name in ("train", "test", "hull", "inner"):
             controls[name].on_update(lambda _, name=name: self._show(name))
         controls["runs"].on_update(lambda _: self._again())
         controls["pictures"].on_update(lambda _: self._add_all_views())
         controls["opacity"].on_update(lambda _: self._add_hull())
         controls["crop"].on_update(lambda _: self._add_runs())
-        for name in ("render", "background", "error", "run", "split"):
+        for name in ("render", "background", "split"):
             if name in controls:
-                controls[name].on_update(
-                    lambda _, name=name: self._add_runs() if name == "run" else self._again()
-                )
+                controls[name].on_update(lambda _: self._again())
+        for name in ("error", "compare"):
+            if name in controls:
+                controls[name].on_update(lambda _: self._change_look())
+        if "run" in controls:
+            controls["run"].on_update(lambda _: self._add_runs())
+
+    def _change_look(self) -> None:
+        """Shows the controls that the comparison has, and hides what does not lie upon the picture."""
+        if "compare" in self.controls:
+            comparison = self.look.comparison
+            self.controls["split"].visible = comparison == UNDER_SLIDER
+            self.controls["run"].visible = comparison == COMPARISONS[-1]
+        self.controls["state"].content = ""
+        for name in ("train", "test", "hull", "inner"):
+            self._show(name)
+        self._again()
 
     def _show(self, name: str) -> None:
         for handle in self.handles[name]:
-            handle.visible = self.controls[name].value
+            handle.visible = self.controls[name].value and not self._covered
 
     def _clear(self, name: str) -> None:
         for handle in self.handles[name]:
@@ -164,7 +184,7 @@ class Viewer:
                         thickness=0.003 * self.size,
                         color=_COLOURS[part],
                         image=image,
-                        visible=self.controls[part].value,
+                        visible=self.controls[part].value and not self._covered,
                         **pose_of(camera, self.middle),
                     )
                 )
@@ -190,7 +210,7 @@ class Viewer:
                             color=colour,
                             opacity=self.controls["opacity"].value,
                             side="double",
-                            visible=self.controls[name].value,
+                            visible=self.controls[name].value and not self._covered,
                         )
                     )
 
@@ -265,16 +285,19 @@ class Viewer:
             part = "train" if views is self.subject.scene.train else "test"
             for i, handle in enumerate(self.handles[part]):
                 # Its own picture would stand before the eye.
-                handle.visible = self.controls[part].value and names[i] != name
+                handle.visible = self.controls[part].value and names[i] != name and not self._covered
             if name in names:
                 for client in self.server.get_clients().values():
                     self._place(client, views.cameras[names.index(name)])
 
     def _moved(self, client: Any) -> None:
         self.moved[client.client_id] = time.monotonic()
-        if self.drawn.pop(client.client_id, None) is not None:
+        # Two runs beside each other are drawn while the camera moves, too: the last picture stays until then.
+        self.drawn.pop(client.client_id, None)
+        if client.client_id in self._pictured and not self._covered:
+            self._pictured.discard(client.client_id)
             client.scene.set_background_image(None)
-        self._show_runs(True)
+        self._show_runs(not self._covered)
 
     def _again(self) -> None:
         """The pictures at rest are drawn anew."""
@@ -310,58 +333,44 @@ class Viewer:
 
     def _refine(self, client: Any) -> None:
         """Draws the next finer picture of a camera that rests."""
-        since = self.moved.get(client.client_id)
-        if since is None or not self.controls["render"].value or time.monotonic() - since < _REST:
+        since, covered = self.moved.get(client.client_id), self._covered
+        if since is None or not (self.controls["render"].value or covered):
             return
         level = self.drawn.get(client.client_id, (since, 0))[1]
-        if level >= len(WIDTHS):
+        resting = time.monotonic() - since >= _REST or (covered and level == 0)
+        if level >= len(WIDTHS) or not resting:
             return
+        began = time.monotonic()
         with self._lock:
             picture = self.draw(client.camera, WIDTHS[level])
-        if self.moved.get(client.client_id) == since:
+        slow = time.monotonic() - began > _PATIENCE
+        still = self.moved.get(client.client_id) == since
+        if still or covered:
+            self._pictured.add(client.client_id)
             client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90)
-            self.drawn[client.client_id] = since, level + 1
+        if still:
+            self.drawn[client.client_id] = since, len(WIDTHS) if slow else level + 1
             self._show_runs(False)
 
     def draw(self, view: Any, width: int) -> np.ndarray:
-        """(H, W, 3) uint8 as the runs render it, or how far that is from the nearest photograph's render.
-
-        Args:
-            view: wxyz, position, fov and aspect of a browser's camera.
-        """
-        size = width, max(1, round(width / float(view.aspect)))
-        camera = camera_from(view.wxyz, view.position, float(view.fov), size, self.middle)
-        if self.controls["error"].value:
-            return self._draw_error(camera, width)
-        share = self.controls["split"].value / 100 if "split" in self.controls else 1.0
-        edge = round(share * size[0])
-        left = self._render(self.chosen, camera)
-        if edge >= size[0]:
-            return left
-        right = self._render((self.chosen + 1) % len(self.subject.runs), camera)
-        picture = np.concatenate([left[:, :edge], right[:, edge:]], 1)
-        picture[:, min(edge, size[0] - 1)] = (224, 33, 138)
+        """(H, W, 3) uint8 of a browser's view (wxyz, position, fov, aspect) as the controls ask for it."""
+        picture, said = draw(self.subject, view, width, self.middle, self.look)
+        if said is not None:
+            self.controls["state"].content = said
         return picture
 
-    def _render(self, number: int, camera: Cameras) -> np.ndarray:
-        run = self.subject.runs[number]
-        shade = _BACKGROUNDS[self.controls["background"].value]
-        with torch.no_grad():
-            render = run.renderer.render(camera.to(run.device), torch.full((3,), shade, device=run.device))
-        return to_bytes(render.rgb.detach().cpu())
+    @property
+    def look(self) -> Look:
+        """What the controls ask for."""
+        controls = self.controls
+        comparison, share = COMPARISONS[-1], 0.5
+        if "compare" in controls:
+            comparison, share = controls["compare"].value, controls["split"].value / 100
+        shade = _BACKGROUNDS[controls["background"].value]
+        return Look(self.chosen, comparison, share, shade, controls["error"].value)
 
-    def _draw_error(self, camera: Cameras, width: int) -> np.ndarray:
-        """Error against the nearest photograph, from where that was taken."""
-        import cv2
-
-        views = self.subject.scene.train
-        i = nearest_view(views.cameras, camera)
-        own = views.cameras[i]
-        height = max(1, round(int(own.height) * width / int(own.width)))
-        run = self.subject.runs[self.chosen]
-        white = torch.ones(3, device=run.device)
-        with torch.no_grad():
-            render = run.renderer.render(own.resized(width, height).to(run.device), white)
-        truth = cv2.resize(draw_truth(views, i, views.mask_origin(i) == "given"), (width, height))
-        self.controls["state"].content = f"error against {views.names[i]}"
-        return draw_error(truth, to_bytes(render.rgb.detach().cpu()))
+    @property
+    def _covered(self) -> bool:
+        """Whether pictures are shown that the browser's own scene does not lie upon."""
+        look = self.look
+        return bool(self.subject.runs) and (look.error or look.comparison == SIDE_BY_SIDE)

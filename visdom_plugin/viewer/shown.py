@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,6 +46,10 @@ class Subject:
     scene: Scene
     hull: Hull | None
     runs: tuple[Reconstruction, ...] = ()
+    path: Path | None = None
+    """Of the first run or file."""
+    path_file: Path = Path("camera_path.json")
+    """Where a camera path is saved."""
 
 
 def splat_arrays(gaussians: Gaussians, offset: np.ndarray) -> dict[str, np.ndarray]:

@@ -117,7 +117,9 @@ def open_shown(options: Options) -> Subject:
         raise CheckpointError("the two runs are of different scenes or views", where=options.beside)
     runs = tuple(_shown(path, found, n) for n, (path, found) in enumerate(zip(paths, opened, strict=True)))
     hull = next((o.hull for o in opened if o.hull is not None), None)
-    return Subject(opened[0].scene, hull or carve_reference(opened[0].scene.train), runs)
+    first = paths[0]
+    saved = first / "camera_path.json" if is_run(first) else first.with_name(f"{first.stem}_camera_path.json")
+    return Subject(opened[0].scene, hull or carve_reference(opened[0].scene.train), runs, first, saved)
 
 
 def _shown(path: Path, found: Any, number: int) -> Reconstruction:
