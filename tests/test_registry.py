@@ -202,6 +202,19 @@ def test_dropping_samples_is_refused_where_the_method_does_not_say_that_it_does(
     assert replace(preset.quick, vd=on).vd.drop_outside
 
 
+def test_virtual_views_are_refused_where_the_method_does_not_say_that_it_trains_them():
+    asked = SamplerConfig(True, virtual_views="between")
+    with pytest.raises(ConfigError, match="does not say that it trains their rays") as caught:
+        Plain(3, hull=VisibleDomain(), vd=asked)
+    assert "vd.virtual-views" in caught.value.where
+
+    @dataclass(frozen=True)
+    class Able(Plain):
+        trains_empty_rays = True
+
+    assert Able(3, hull=VisibleDomain(), vd=asked).vd == asked
+
+
 def test_settings_with_inherited_fields_are_checked():
     for preset in MethodSpec("m", TARGET, Strict(), hook="sampler").presets().values():
         with pytest.raises(ConfigError, match="below 1"):

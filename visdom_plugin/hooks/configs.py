@@ -73,6 +73,8 @@ class SamplerMethodConfig(MethodConfig):
     """The visible-domain hook."""
     drops_samples: ClassVar[bool] = False
     """Whether the method asks the hook's `keep` about each sample; without, `vd.drop_outside` is refused."""
+    trains_empty_rays: ClassVar[bool] = False
+    """Whether the method trains the hook's `empty_rays`; without, `vd.virtual_views` is refused."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,6 +91,13 @@ class SamplerMethodConfig(MethodConfig):
                 where=f"{where}.drop-outside",
                 todo="leave it off, or train method:vaxnerf; a method that asks the hook's keep() about each "
                 "sample says so in its config: drops_samples: ClassVar[bool] = True",
+            )
+        if self.vd.virtual_views != "none" and not self.trains_empty_rays:
+            raise ConfigError(
+                "vd.virtual_views is on, but the method does not say that it trains their rays",
+                where=f"{where}.virtual-views",
+                todo="leave it off; a method that adds the loss on the hook's empty_rays() (see hooks.protocols."
+                "EmptySpace) says so in its config: trains_empty_rays: ClassVar[bool] = True",
             )
 
 

@@ -23,6 +23,7 @@ class FieldConfig(SamplerMethodConfig):
     colour_correction: bool = False
     """Fit an affine map of colours to each training view, for captures whose exposure or white balance changes;
     novel views have the colours of the average one."""
+    trains_empty_rays: ClassVar[bool] = True
     few_views: int = 4
     """Up to how many training views are few, for `few_views_share`."""
     few_views_share: float = 1.0

@@ -103,7 +103,7 @@ class Ingp(RadianceField[IngpConfig]):
     ) -> Tensor:
         step_length = torch.full_like(rays.far, self.config.missing_step_length)
         shift = uniform(generator, self.device, len(rays.far))
-        samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks)
+        samples = self._take_samples(rays, rays.far, step_length, shift, [])
         alpha = self._shade(rays, samples, rays.origins.new_ones(len(rays.far), 3))[1]
         return mask_loss(alpha, torch.zeros_like(alpha))
 
