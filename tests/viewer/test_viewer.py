@@ -301,5 +301,16 @@ def test_toggles_change_what_the_browser_shows(viewer):
         moved = next(iter(viewer.server.get_clients().values())).camera.position
         wanted = viewer.subject.scene.train.cameras[1].centres.numpy() - viewer.middle
         assert np.allclose(moved, wanted, atol=0.05) and not np.allclose(position, wanted, atol=0.05)
+        # The eye is in this view's frustum, which is not drawn, whatever is switched meanwhile.
+        own = viewer.handles["train"]
+        viewer.controls["train"].value = True
+        still(page)
+        assert [h.visible for h in own] == [True, False, True, True]
+        viewer.controls["error"].value = True
+        still(page)
+        assert not any(h.visible for h in own)
+        viewer.controls["error"].value = False
+        still(page)
+        assert [h.visible for h in own] == [True, False, True, True]
         # viser's quads of Gaussians have corners of two numbers, of which three.js wants a radius, in vain.
         assert [e for e in page.errors if "Computed radius is NaN" not in e] == []

@@ -31,6 +31,8 @@ _PATIENCE = 1.0
 """Seconds that a picture may have taken for the next one, of four times the pixels, to be drawn."""
 _REST, _LOOK = 0.25, 2.0
 """Seconds for which the camera must be still, and between two looks for a newer state of a run."""
+_AT = 0.03
+"""How near the eye is to a camera whose frustum it is in, in mean camera distances."""
 _BACKGROUNDS = {"white": 1.0, "grey": 0.5, "black": 0.0}
 _COLOURS = {"train": (20, 110, 200), "test": (210, 110, 20)}
 _PICTURE_PX = 160
@@ -69,6 +71,7 @@ class Viewer:
         self.moved: dict[int, float] = {}
         self.drawn: dict[int, tuple[float, int]] = {}
         self._pictured: set[int] = set()
+        self._at: Any = None
         self._done = threading.Event()
         self._lock = threading.RLock()
         self._add_controls()
@@ -93,6 +96,9 @@ class Viewer:
     def _add_controls(self) -> None:
         gui, controls, subject = self.server.gui, self.controls, self.subject
         gui.configure_theme(show_logo=False, show_share_button=False)
+        # Beside the scene, not upon it: two runs side by side need the whole width. viser 1.0 has no such panel.
+        if hasattr(gui, "main_panel"):
+            gui.main_panel.dock_right()
         names = [*subject.scene.train.names, *subject.scene.test.names]
         controls["view"] = gui.add_dropdown("Go to view", ("-", *map(str, names)))
         controls["view"].on_update(self._go_to_view)
@@ -119,7 +125,7 @@ class Viewer:
                 controls["compare"] = gui.add_dropdown("Compare", COMPARISONS)
                 controls["split"] = gui.add_slider("Left run's share", 0, 100, 1, 50, visible=False)
                 controls["run"] = gui.add_dropdown("Run", labels, visible=False)
-                gui.add_markdown(f"left: **{labels[0]}**, right: **{labels[1]}**")
+                controls["sides"] = gui.add_markdown(f"left **{labels[0]}**, right **{labels[1]}**")
             controls["state"] = gui.add_markdown("")
         self.path = PathControls(gui, subject.path_file, self.middle, subject.path)
         for name in ("train", "test", "hull", "inner"):
@@ -143,6 +149,7 @@ class Viewer:
             comparison = self.look.comparison
             self.controls["split"].visible = comparison == UNDER_SLIDER
             self.controls["run"].visible = comparison == COMPARISONS[-1]
+            self.controls["sides"].visible = comparison != COMPARISONS[-1]
         self.controls["state"].content = ""
         for name in ("train", "test", "hull", "inner"):
             self._show(name)
@@ -150,7 +157,8 @@ class Viewer:
 
     def _show(self, name: str) -> None:
         for handle in self.handles[name]:
-            handle.visible = self.controls[name].value and not self._covered
+            # From where a photograph was taken, its own picture would stand before the eye.
+            handle.visible = self.controls[name].value and not self._covered and handle is not self._at
 
     def _clear(self, name: str) -> None:
         for handle in self.handles[name]:
@@ -164,6 +172,7 @@ class Viewer:
     def _add_views(self, part: str) -> None:
         with self._lock:
             self._clear(part)
+            self._at = None
             views, kind = getattr(self.subject.scene, part), self.controls["pictures"].value
             for i, name in enumerate(views.names):
                 camera = views.cameras[i]
@@ -280,18 +289,27 @@ class Viewer:
         self._jump(self.controls["view"].value)
 
     def _jump(self, name: str) -> None:
-        for views in (self.subject.scene.train, self.subject.scene.test):
+        for part in ("train", "test"):
+            views = getattr(self.subject.scene, part)
             names = [str(n) for n in views.names]
-            part = "train" if views is self.subject.scene.train else "test"
-            for i, handle in enumerate(self.handles[part]):
-                # Its own picture would stand before the eye.
-                handle.visible = self.controls[part].value and names[i] != name and not self._covered
             if name in names:
                 for client in self.server.get_clients().values():
                     self._place(client, views.cameras[names.index(name)])
 
+    def _find_own_frustum(self, client: Any) -> None:
+        """Hides the frustum that the eye is in."""
+        eye, found = np.asarray(client.camera.position), None
+        for handle in (*self.handles["train"], *self.handles["test"]):
+            if np.linalg.norm(eye - np.asarray(handle.position)) < _AT * self.size:
+                found = handle
+        if found is not self._at:
+            self._at = found
+            for part in ("train", "test"):
+                self._show(part)
+
     def _moved(self, client: Any) -> None:
         self.moved[client.client_id] = time.monotonic()
+        self._find_own_frustum(client)
         # Two runs beside each other are drawn while the camera moves, too: the last picture stays until then.
         self.drawn.pop(client.client_id, None)
         if client.client_id in self._pictured and not self._covered:
