@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from my_method.field import Field as WholeField
 
-from method_configs import corgs_lite, gs_go, ingp, zipnerf_lite
+from method_configs import corgs_lite, gs_go, ingp, visdom_field, visdom_gs, zipnerf_lite
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
 from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.domain import VisibleDomain
@@ -311,9 +311,20 @@ def _field_spec(name: str, target: str, settings: type, vd: type | None) -> Meth
     )
 
 
+SMALL_SPLATS = {"steps": 24, "initial_points": 400, "max_gaussians": 600}
+SMALL_INGP = {
+    "steps": 40,
+    "max_rays": 256,
+    "samples_per_step": 1 << 12,
+    "step_length": 0.03,
+    "missing_step_length": 0.2,
+    "grid": HashLayout(4, 2, base_resolution=8, max_resolution=64, log2_table_size=12),
+    "occupancy_resolution": 32,
+}
+
+
 def _splat_presets(name: str, target: str, module) -> list[Preset]:
-    small = {"steps": 24, "initial_points": 400, "max_gaussians": 600}
-    bare = replace(module.SPEC.quick, **small, mask_weight=0.0)
+    bare = replace(module.SPEC.quick, **SMALL_SPLATS, mask_weight=0.0)
     regularizer = RegularizerConfig(enabled=True, weight=0.1, prune_every=10, bank=4)
     # Wide, as the bare methods' hull is: it is the losses' doing that opacity falls.
     vd = replace(bare, mask_weight=1.0, hull=HULL, vd=regularizer, lr_opacity=0.1)
@@ -324,6 +335,13 @@ def _field_presets(name: str, target: str, module, **small) -> list[Preset]:
     bare = replace(module.SPEC.quick, **small)
     vd = replace(bare, mask_weight=0.1, background="random", hull=HULL, vd=SamplerConfig(enabled=True))
     return [Preset(name, "", target, bare, bare), Preset(f"{name}+vd", "", target, vd, vd)]
+
+
+def _recipe(name: str, module, small: dict) -> Preset:
+    """A method that has no variant without the hook."""
+    (whole,) = module.SPEC.presets().values()
+    config = replace(whole.quick, **small, hull=HULL)
+    return Preset(name, "", whole.target, config, config)
 
 
 def _methods() -> list[MethodSpec | Preset]:
@@ -338,19 +356,12 @@ def _methods() -> list[MethodSpec | Preset]:
         )
     found += _splat_presets("SmallGsGo", "visdom_plugin.methods.splats.gs_go:GsGo", gs_go)
     found += _splat_presets("SmallCorgs", "visdom_plugin.methods.splats.corgs_lite:CorgsLite", corgs_lite)
-    grid = HashLayout(4, 2, base_resolution=8, max_resolution=64, log2_table_size=12)
-    found += _field_presets(
-        "SmallIngp",
-        "visdom_plugin.methods.fields.ingp:Ingp",
-        ingp,
-        steps=40,
-        max_rays=256,
-        samples_per_step=1 << 12,
-        step_length=0.03,
-        missing_step_length=0.2,
-        grid=grid,
-        occupancy_resolution=32,
+    found.append(
+        _recipe("SmallVisdomGs", visdom_gs, SMALL_SPLATS | {"vd": RegularizerConfig(enabled=True, bank=4)})
     )
+    found += _field_presets("SmallIngp", "visdom_plugin.methods.fields.ingp:Ingp", ingp, **SMALL_INGP)
+    found.append(_recipe("SmallVisdomField", visdom_field, SMALL_INGP))
+    grid = SMALL_INGP["grid"]
     found += _field_presets(
         "SmallZipNerf",
         "visdom_plugin.methods.fields.zipnerf_lite:ZipNerfLite",
@@ -368,5 +379,13 @@ def _methods() -> list[MethodSpec | Preset]:
 
 
 METHODS = _methods()
-WHOLE = ("SmallField", "SmallGsGo", "SmallCorgs", "SmallIngp", "SmallZipNerf")
+WHOLE = (
+    "SmallField",
+    "SmallGsGo",
+    "SmallCorgs",
+    "SmallVisdomGs",
+    "SmallIngp",
+    "SmallVisdomField",
+    "SmallZipNerf",
+)
 """Those that break nothing: the example and the built-in methods, small."""

@@ -16,7 +16,6 @@ from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
 from visdom_plugin.conformance.report import require
 from visdom_plugin.errors import list_some
-from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.registry import Preset, Registry
 from visdom_plugin.scene import Scene
@@ -25,6 +24,7 @@ from visdom_plugin.training.evaluate import hull_silhouette, render_on_white
 from visdom_plugin.training.metrics import outside_hull_mass
 from visdom_plugin.training.protocols import Method, StepOutput
 from visdom_plugin.training.run import choose_batches, make_hooks
+from visdom_plugin.training.runs.saved_hulls import find_hull
 
 CPU = torch.device("cpu")
 LENGTH = 60
@@ -39,10 +39,15 @@ def scene() -> Scene:
     return make_scene(SyntheticConfig(size=(200, 160), downscale=4, test_views=4))
 
 
-@cache
-def carve(domain: VisibleDomain) -> Hull:
-    """The hull of the training views; each domain once."""
-    return domain.carve(*scene().train.silhouettes())
+_HULLS: dict[str, Hull | None] = {}
+
+
+def hull_for(config: Any) -> Hull | None:
+    """The hull that a training run hands to a method of this config, found once; None where it asks for none."""
+    key = repr(config)
+    if key not in _HULLS:
+        _HULLS[key] = find_hull(config, scene().train, None)
+    return _HULLS[key]
 
 
 @dataclass
@@ -86,9 +91,7 @@ class Subject:
     ) -> Method:
         """A method, set up as a training run does it; with other hooks if they are given. `luck` as in `run`."""
         config = self.config if config is None else config
-        domain = getattr(config, "hull", None)
-        hull = None if domain is None else carve(domain)
-        views = scene().train
+        hull, views = hull_for(config), scene().train
         method = self.main.load()(config)
         hooks = make_hooks(config, hull, views) if hooks is None else hooks
         seed_all(1000 * luck)
@@ -97,7 +100,7 @@ class Subject:
 
     def make_hook(self, device: torch.device = CPU) -> object:
         """A new hook, as the variant with the hook gets it."""
-        (hook,) = make_hooks(self.config, carve(self.config.hull), scene().train)
+        (hook,) = make_hooks(self.config, hull_for(self.config), scene().train)
         return hook
 
     def run(self, method: Method, first: int, last: int, keep: tuple[int, ...] = (), luck: int = 0) -> Run:

@@ -11,7 +11,7 @@ import torch
 
 from visdom_plugin.conformance.probes import GaussianProbe, SamplerProbe, distance, gradient
 from visdom_plugin.conformance.report import require
-from visdom_plugin.conformance.subject import carve, mass_outside, scene
+from visdom_plugin.conformance.subject import hull_for, mass_outside, scene
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import GaussianHook, SamplerHook
@@ -228,4 +228,4 @@ def follow(subject) -> tuple[GaussianProbe, list]:
 
 
 def hull_of(subject):
-    return carve(subject.config.hull)
+    return hull_for(subject.config)
