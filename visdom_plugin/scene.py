@@ -100,6 +100,10 @@ class Views:
         ignored = self.ignored(index)
         return self.masks[index] if ignored is None else self.masks[index] & ~ignored
 
+    def with_masks(self) -> list[int]:
+        """The views whose mask was given."""
+        return [i for i in range(len(self)) if self.mask_origin(i) == "given"]
+
     def silhouettes(self) -> tuple[Cameras, Sequence[Tensor], Sequence[Tensor | None]]:
         """What may carve: the cameras, masks and ignored pixels of the views whose mask was given.
 
@@ -111,7 +115,7 @@ class Views:
         """
         if not self.mask_origins and not self.ignore:
             return self.cameras, self.masks, ()
-        given = [i for i in range(len(self)) if self.mask_origin(i) == "given"]
+        given = self.with_masks()
         if not given:
             raise SceneError(
                 f"none of the {len(self)} training views has a foreground mask, and a hull is carved from masks",

@@ -37,9 +37,9 @@ def searches(monkeypatch):
     """The settings of every search for a shape."""
     made, search = [], shape.shape_inside
 
-    def noted(hull, cameras, masks, ignore=(), config=None):
+    def noted(hull, cameras, masks, ignore=(), config=None, images=None):
         made.append(config)
-        return search(hull, cameras, masks, ignore, config=config)
+        return search(hull, cameras, masks, ignore, config, images)
 
     monkeypatch.setattr(shape, "shape_inside", noted)
     return made

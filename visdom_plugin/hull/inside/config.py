@@ -37,6 +37,12 @@ class InsideConfig:
     steps: int = 60
     """Steps on the coarsest grid; each finer one takes half as many, but at least 8."""
 
+    photo_weight: float = 0.0
+    """How much of a voxel's surroundings must speak for it beyond half, where the photographs that see it show
+    different colours; 0 leaves the shape to the silhouettes. Needs the photographs."""
+    photo_tolerance: float = 0.2
+    """Standard deviation of such colours, of 1, at which 1 - 1/e of that is asked."""
+
     def __post_init__(self) -> None:
         def refuse(what: str, todo: str) -> None:
             raise ConfigError(what, where="InsideConfig", todo=todo)
@@ -49,3 +55,7 @@ class InsideConfig:
             )
         if self.steps < 1:
             refuse(f"steps is {self.steps}", "use 1 or more")
+        if not 0 <= self.photo_weight <= 0.5:
+            refuse(f"photo_weight is {self.photo_weight}", "use 0 to 0.5, such as 0.15")
+        if not 0 < self.photo_tolerance < float("inf"):
+            refuse(f"photo_tolerance is {self.photo_tolerance}", "use a positive number, such as 0.2")

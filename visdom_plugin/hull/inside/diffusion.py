@@ -18,6 +18,7 @@ SIGMA = 1.0
 """Standard deviation of the blur, voxels."""
 RAMP = 2.5
 """Width of a surface's ramp from 0 to 1, voxels."""
+NOTHING: np.ndarray = np.zeros((0, 0, 0), np.float32)
 _REACH = 4
 _DRIFT = 1.26
 """Speed of a flat ramp that is cut lower, in units of what its slope alone makes it: the cut's ends bend the ramp.
@@ -64,7 +65,7 @@ def _blur_slabs(begin: int, end: int, u: np.ndarray, weights: np.ndarray, out: n
 @kernel()
 def _finish_rows(
     begin: int, end: int, half: np.ndarray, weights: np.ndarray, cut: float, slope: float, cap: np.ndarray,
-    blurred: np.ndarray, u: np.ndarray,
+    against: np.ndarray, blurred: np.ndarray, u: np.ndarray,
 ) -> None:  # fmt: skip
     """Blurs rows (x, y), flattened, along x; cuts and caps them."""
     nx, ny, nz = half.shape
@@ -78,12 +79,20 @@ def _finish_rows(
             for k in range(nz):
                 blurred[i, j, k] += w * half[i + t, j, k]
         for k in range(nz):
-            value = np.float32(0.5) + slope * (blurred[i, j, k] - cut)
+            doubt = against[i, j, k] if len(against) else np.float32(0)
+            value = np.float32(0.5) + slope * (blurred[i, j, k] - doubt - cut)
             value = min(max(value, np.float32(0)), np.float32(1))
             u[i, j, k] = value if cap[i, j, k] else np.float32(0)
 
 
-def diffuse(u: np.ndarray, cap: np.ndarray, radius: float, half: np.ndarray, blurred: np.ndarray) -> None:
+def diffuse(
+    u: np.ndarray,
+    cap: np.ndarray,
+    radius: float,
+    half: np.ndarray,
+    blurred: np.ndarray,
+    against: np.ndarray = NOTHING,
+) -> None:
     """One step, in place.
 
     Args:
@@ -92,8 +101,9 @@ def diffuse(u: np.ndarray, cap: np.ndarray, radius: float, half: np.ndarray, blu
         radius: R, voxels.
         half: (X, Y, Z) float32, room to work in.
         blurred: (X, Y, Z) float32; comes out as the blurred shape.
+        against: (X, Y, Z) float32, what speaks against each voxel, in units of the blurred shape; or `NOTHING`.
     """
     weights, (nx, ny, _) = blur_weights(), u.shape
     cut, slope = np.float32(cut_level(radius)), np.float32(_SLOPE)
     parallel_for(_blur_slabs, nx, 4, u, weights, half)
-    parallel_for(_finish_rows, nx * ny, 256, half, weights, cut, slope, cap, blurred, u)
+    parallel_for(_finish_rows, nx * ny, 256, half, weights, cut, slope, cap, against, blurred, u)

@@ -14,7 +14,8 @@ from visdom_plugin.hull.carving.votes import Grid, Silhouettes, gather_silhouett
 from visdom_plugin.hull.grid.components import find_pieces
 from visdom_plugin.hull.hull import Hull, occupied_box
 from visdom_plugin.hull.inside.config import InsideConfig
-from visdom_plugin.hull.inside.diffusion import cut_level, diffuse
+from visdom_plugin.hull.inside.diffusion import NOTHING, cut_level, diffuse
+from visdom_plugin.hull.inside.photo_consistency import PhotoConsistency
 from visdom_plugin.hull.inside.pyramid import pool, refine
 from visdom_plugin.hull.inside.silhouette_rays import draw_rays, give_back
 
@@ -24,13 +25,20 @@ _LEAST_VIEWS = 3
 _COARSEST = 40
 """Most voxels along the longest side of the coarsest grid."""
 _LEAST_STEPS = 8
+_PHOTO_EVERY = 4
+"""Steps between two looks at the photographs."""
 _BALL = 3.0
 """Radius in voxels of what a ray that misses the shape is given. The blur overlooks a single voxel: the shape
 would go on shrinking past it, and nothing but sheets of such voxels would stay."""
 
 
 def shape_inside(
-    hull: Hull, cameras: Cameras, masks: Sequence, ignore: Sequence = (), config: InsideConfig | None = None
+    hull: Hull,
+    cameras: Cameras,
+    masks: Sequence,
+    ignore: Sequence = (),
+    config: InsideConfig | None = None,
+    images: Sequence | None = None,
 ) -> Hull:
     """The smoothest full shape inside a hull that covers of the masks what the hull covers; see `InsideConfig`.
 
@@ -39,6 +47,8 @@ def shape_inside(
         cameras: (N,) cameras.
         masks: N tensors or arrays (H, W), True on the object.
         ignore: N tensors or arrays (H, W) bool or None, True where nothing is known, or empty.
+        images: N tensors or arrays (H, W, 3), the photographs: `config.photo_weight` is about them. Without them
+            silhouettes alone decide.
 
     Returns:
         A Hull on the hull's own grid, each of its voxels one of the hull's. Its summary is the hull's with kind
@@ -58,7 +68,12 @@ def shape_inside(
     window = tuple(slice(a, b) for a, b in box.T)
     grid = Grid(hull.bounds[0] + box[0] * hull.voxel_edges, hull.voxel_size, tuple(box[1] - box[0]))
     radius = config.radius * hull.radius
-    u, blurred = _flow(hull.occupancy[window], grid, radius, cameras.to("cpu"), silhouettes, config)
+    photographs = None
+    if images is not None and config.photo_weight > 0:
+        photographs = PhotoConsistency(cameras.to("cpu"), silhouettes, images, config.photo_tolerance)
+    u, blurred = _flow(
+        hull.occupancy[window], grid, radius, cameras.to("cpu"), silhouettes, config, photographs
+    )
     cap = pool(hull.occupancy[window], 1)
     u = (u > 0.5).astype(np.uint8)
     cut = cut_level(radius / grid.voxel)
@@ -118,6 +133,7 @@ def _flow(
     cameras: Cameras,
     silhouettes: Silhouettes,
     config: InsideConfig,
+    photographs: PhotoConsistency | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The shape u and the blurred shape on `grid`, float32, from coarse to fine; `radius` in scene units."""
     longest, finest = max(grid.shape), 1
@@ -131,9 +147,12 @@ def _flow(
     while True:
         level = Grid(grid.lower, grid.voxel * factor, cap.shape)
         rays = draw_rays(cameras, silhouettes, level).that_meet(cap)
-        half, blurred, missed = np.empty_like(u), np.empty_like(u), 0
-        for _ in range(steps):
-            diffuse(u, cap, radius / level.voxel, half, blurred)
+        half, blurred, missed = np.empty_like(u), u.copy(), 0
+        against: np.ndarray = NOTHING
+        for step in range(steps):
+            if photographs is not None and step % _PHOTO_EVERY == 0:
+                against = np.float32(config.photo_weight) * photographs.contradiction(u, blurred, level)
+            diffuse(u, cap, radius / level.voxel, half, blurred, against)
             missed = give_back(rays, u, cap, blurred, cut_level(radius / level.voxel), _BALL)
         log.debug("%s voxels: %d of %d rays missed in the last step", cap.shape, missed, len(rays))
         if factor == finest:

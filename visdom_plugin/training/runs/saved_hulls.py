@@ -45,7 +45,9 @@ def _find_inner(config: Any, hull: Hull, views: Views, saved: Path | None) -> Hu
         from visdom_plugin.hull.inside.shape import shape_inside
 
         try:
-            inner = shape_inside(hull, *views.silhouettes(), config=config.inside)
+            images = [views.images[i] for i in views.with_masks()]
+            cameras, masks, ignore = views.silhouettes()
+            inner = shape_inside(hull, cameras, masks, ignore, config.inside, images)
         except ConfigError as error:
             log.warning("training goes by the hull alone, not by the shape inside it: %s", error.what)
     return inner
