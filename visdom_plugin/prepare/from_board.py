@@ -15,6 +15,7 @@ from visdom_plugin.prepare.photographs import FULL_FRAME_MM, Photograph, require
 from visdom_plugin.prepare.placed import Placed, make_cameras
 from visdom_plugin.prepare.settings import BoardSettings
 
+_FEW = 6
 _LOOKED_AT = 4
 """Photographs in which other boards are looked for."""
 
@@ -82,12 +83,15 @@ def _refuse(photographs: Sequence[Photograph], found: Sequence[Corners], setting
     others: list[str] = []
     for photograph in photographs[:_LOOKED_AT]:
         others = others or other_boards(_grey(photograph), settings)
-    markers = sum(c.markers for c in found)
+    markers = max(c.markers for c in found)
     columns, rows = settings.squares
     board = f"{columns} x {rows} squares, markers {settings.dictionary.upper()}"
     if others:
         cause, todo = f"the photographs show markers of {others[0]}", f"pass --dictionary {others[0]}"
         todo += ", and --squares, --square-mm and --marker-mm of that board"
+    elif 0 < markers < _FEW:
+        cause = f"{markers} of its markers can be read at most: it is covered, blurred or too small"
+        todo = "show more of the board, sharper and larger; the object may be beside it"
     elif markers:
         cause = f"{markers} of its markers were read, but not where such a board has them"
         todo = "give the board's own --squares; try --legacy for one made by OpenCV before 4.6"

@@ -22,14 +22,15 @@ from visdom_plugin.prepare.from_board import place_by_board
 from visdom_plugin.prepare.masks.choose import choose_masks
 from visdom_plugin.prepare.photographs import Photograph, find_photographs
 from visdom_plugin.prepare.placed import Placed, read_placed, turn_upright
+from visdom_plugin.prepare.poses.by_colmap import place_by_colmap
 from visdom_plugin.prepare.poses.find import holds_poses, place_by_file
 from visdom_plugin.prepare.settings import BoardSettings, MaskSettings
 from visdom_plugin.prepare.sheet import draw_outlines
 
 log = logging.getLogger(__name__)
 
-BOARD = Path("board")
-"""In place of a file of poses: those of the printed board."""
+BOARD, COLMAP = Path("board"), Path("colmap")
+"""In place of a file of poses: those of the printed board, or of COLMAP, which is run."""
 _MIRRORED = (2, 4, 5, 7)
 _GEOMETRY = ("axes", "centres", "disagreement", "order", "principal", "scale", "swapped", "view")
 """Kinds of the check's findings that speak of cameras."""
@@ -45,7 +46,7 @@ class Plan:
     """Longest side of the pictures written, in pixels; 0 for the photographs' own."""
     masks_folder: str | None = None
     poses: Path | None = None
-    """File or folder of poses, or BOARD; None takes those in the folder of the photographs, or the board."""
+    """File or folder of poses, BOARD or COLMAP; None takes those beside the photographs, or the board."""
     focal_35mm: float | None = None
     overwrite: bool = False
     board: BoardSettings = field(default_factory=BoardSettings)
@@ -106,8 +107,8 @@ def _asked(plan: Plan, photographs: Sequence[Photograph]) -> dict[str, Any]:
     for name in ("photographs", "out", "overwrite"):
         del settings[name]
     asked = {"settings": write.as_plain(settings), "photographs": {p.name: p.sha256 for p in photographs}}
-    if plan.poses is not None and plan.poses != BOARD:
-        asked["poses"] = write.hash_files(plan.poses)
+    if plan.poses not in (None, BOARD, COLMAP):
+        asked["poses"] = write.hash_files(plan.poses or BOARD)
     return asked
 
 
@@ -120,6 +121,8 @@ def _keep(plan: Plan, changed: list[str]) -> Prepared:
 
 
 def _place(photographs: Sequence[Photograph], plan: Plan, root: Path) -> Placed:
+    if plan.poses == COLMAP:
+        return place_by_colmap(photographs)
     if plan.poses is not None and plan.poses != BOARD:
         return place_by_file(plan.poses, photographs)
     if plan.poses is None and holds_poses(root):

@@ -35,10 +35,15 @@ class Options(BoardSettings):
     """Write the board as PDF at true size, and nothing else."""
     paper: Literal["a4", "letter", "a3", "tabloid"] = "a4"
     """Paper to print the board on."""
+    demo: Path | None = None
+    """Write photographs of the built-in object on the board into this folder, to try the command with; and nothing
+    else."""
     poses: Path | None = None
     """Poses of another program, in place of a board's: a COLMAP model, transforms.json, Metashape's XML,
     RealityScan's CSV or XMP, Record3D, Polycam, 3D Scanner App, VGGT, pi3, DUSt3R. board: those of the board, even
     where PHOTOS has others."""
+    colmap: bool = False
+    """Run COLMAP for poses (extra colmap); 10 photographs at least, better 20 to 50, that overlap."""
     focal_35mm: float | None = None
     """Focal length as its 35 mm equivalent, where the files have no EXIF data and the views do not tell it."""
     masks: str | None = None
@@ -77,6 +82,9 @@ def _main(argv: Sequence[str]) -> None:
     if options.print_board is not None:
         _print_board(options, board)
         return
+    if options.demo is not None:
+        _write_demo(options, board)
+        return
     if options.photographs is None:
         raise ConfigError(
             "no folder of photographs is named",
@@ -98,7 +106,7 @@ def _main(argv: Sequence[str]) -> None:
         out=out,
         size=options.size,
         masks_folder=options.masks,
-        poses=options.poses,
+        poses=_find_poses(options),
         focal_35mm=options.focal_35mm,
         overwrite=options.overwrite,
         board=board,
@@ -118,6 +126,28 @@ def _print_board(options: Options, board: BoardSettings) -> None:
     print_board(options.print_board, board, options.paper)
     if not options.quiet:
         sys.stdout.write(f"{options.print_board}: print it at 100 %, check the ruler, and lay it flat\n")
+
+
+def _write_demo(options: Options, board: BoardSettings) -> None:
+    from visdom_plugin.prepare.demo import DemoConfig, write_demo
+
+    assert options.demo is not None
+    if options.demo.exists() and (not options.demo.is_dir() or any(options.demo.iterdir())):
+        raise ConfigError(
+            "there is something of this name", where=f"--demo {options.demo}", todo="name a new folder"
+        )
+    board.check()
+    truths = write_demo(options.demo, DemoConfig(), board)
+    if not options.quiet:
+        sys.stdout.write(
+            f"{len(truths)} photographs in {options.demo}; next: visdom-prepare {options.demo}\n"
+        )
+
+
+def _find_poses(options: Options) -> Path | None:
+    if options.colmap and options.poses is not None:
+        raise ConfigError("poses of two sources: --poses and --colmap", todo="name one")
+    return Path("colmap") if options.colmap else options.poses
 
 
 def _summary(made: Prepared, out: Path) -> str:
