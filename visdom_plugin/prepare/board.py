@@ -30,6 +30,8 @@ _LIKELY = ("4X4_50", "5X5_50", "6X6_50", "7X7_50", "5X5_100", "6X6_250", "5X5_10
            "APRILTAG_36H11")  # fmt: skip
 """Dictionaries that are tried where the board's own finds nothing."""
 LEAST_CORNERS = 6
+_WINDOW, _MOST_WINDOW = 0.2, 12
+"""Half a corner's window, in distances to the nearest other corner, and in pixels at most."""
 
 
 class Corners(NamedTuple):
@@ -83,9 +85,32 @@ def find_corners(grey: np.ndarray, settings: BoardSettings) -> Corners:
     if ids is None or uv is None or len(ids) == 0:
         return Corners(np.zeros(0, np.int64), np.zeros((0, 2)), count)
     # OpenCV 5 has (M, 2) and OpenCV 4 (M, 1, 2); its origin is the first pixel's centre.
-    return Corners(
-        np.asarray(ids, np.int64).reshape(-1), np.asarray(uv, np.float64).reshape(-1, 2) + 0.5, count
-    )
+    fine = _refine(grey, np.asarray(uv, np.float32).reshape(-1, 2))
+    return Corners(np.asarray(ids, np.int64).reshape(-1), fine + 0.5, count)
+
+
+def _refine(grey: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """(M, 2) float64 corners between pixels, each found in a window that no other corner reaches.
+
+    OpenCV's own window takes in what lies behind foreshortened squares.
+    """
+    import cv2
+
+    if len(uv) < 2:
+        return uv.astype(np.float64)
+    apart = np.linalg.norm(uv[:, None] - uv[None], axis=-1)
+    nearest = np.where(apart > 0, apart, np.inf).min(1)
+    reach = np.clip(_WINDOW * nearest, 2, _MOST_WINDOW).round().astype(int)
+    found = uv.astype(np.float64)
+    end = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-3)
+    for size in np.unique(reach):
+        of_size = np.flatnonzero(reach == size)
+        start = uv[of_size].reshape(-1, 1, 2).copy()
+        moved = cv2.cornerSubPix(grey, start, (int(size), int(size)), (-1, -1), end).reshape(-1, 2)
+        # A corner that runs away follows another edge: it stays where it was.
+        near = np.linalg.norm(moved - uv[of_size], axis=-1) < size
+        found[of_size[near]] = moved[near]
+    return found
 
 
 def other_boards(grey: np.ndarray, settings: BoardSettings) -> list[str]:

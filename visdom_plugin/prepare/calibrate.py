@@ -19,7 +19,9 @@ _FOCAL_STARTS = (0.75, 1.0, 1.4, 2.2, 3.5)
 """In long sides of the image, where EXIF says nothing: wide-angle to short telephoto lenses."""
 _FOCAL_SURE, _RADIAL_SURE = 0.02, 0.15
 """Standard deviations beyond which a focal length (relative) or a radial term is not determined by the views."""
-_OUTLIER_PX = 1.0
+_OUTLIER_PX = 0.3
+_STRAY = 4.0
+"""Corners further off than this many standard deviations are taken for misread: shadows, the object's edge."""
 _BAD_PX, _BAD_RATIO = 2.0, 4.0
 """A view is bad whose mean error is larger than both, at an image of 1000 pixels, and times the views' median."""
 
@@ -87,6 +89,10 @@ def calibrate(
     notes: list[str] = []
     state = solver.start(focal_px, scale)
     state, sigma = solver.solve(state, ("focal", "k1", "k2"))
+    solver, strays = solver.without_strays(state)
+    if strays:
+        notes.append(f"{strays} corners are left out, which do not fit the others")
+        state, sigma = solver.solve(state, ("focal", "k1", "k2"))
     free = ["focal", "k1", "k2"]
     for which, name in ((2, "k2"), (1, "k1")):
         if sigma[which] > _RADIAL_SURE:
@@ -108,7 +114,8 @@ def calibrate(
             f"stays at EXIF's {focal_px:.0f} px"
         )
         state[0] = math.log(focal_px)
-        state, sigma = solver.solve(state, [f for f in free if f != "focal"])
+        free.remove("focal")
+        state, sigma = solver.solve(state, free)
     errors = solver.errors(state)
     limit = max(_BAD_PX * scale / 1000, _BAD_RATIO * float(np.median(errors)))
     bad = errors > limit
@@ -121,7 +128,7 @@ def calibrate(
             )
         solver, state = solver.keep(kept), np.concatenate([state[:3], state[3:].reshape(-1, 6)[kept].ravel()])
         used = [used[i] for i in kept]
-        state, sigma = solver.solve(state, free if "stays at EXIF" not in " ".join(notes) else free[1:])
+        state, sigma = solver.solve(state, free)
         errors = solver.errors(state)
     poses = dict(zip(used, zip(errors, solver.poses(state), strict=True), strict=True))
     views = tuple(
@@ -169,6 +176,20 @@ class _Solver:
     def keep(self, which: np.ndarray) -> _Solver:
         """The same for some of the views."""
         return _Solver([self.corners[i] for i in which], self.points, [self.sizes[i] for i in which])
+
+    def without_strays(self, state: np.ndarray) -> tuple[_Solver, int]:
+        """The same without corners that do not fit, as far as views keep enough; and how many these are."""
+        r = np.hypot(*self._residuals(state)[0].reshape(-1, 2).T)
+        # Of two normal errors, the distance has a median of 1.18 standard deviations.
+        limit = max(_STRAY * float(np.median(r)) / 1.18, _OUTLIER_PX)
+        kept, start = [], 0
+        for c in self.corners:
+            fine = r[start : start + len(c.ids)] < limit
+            start += len(c.ids)
+            fine = fine if fine.sum() >= LEAST_CORNERS else np.ones_like(fine)
+            kept.append(c._replace(ids=c.ids[fine], uv=c.uv[fine]))
+        count = sum(len(a.ids) - len(b.ids) for a, b in zip(self.corners, kept, strict=True))
+        return _Solver(kept, self.points, self.sizes), count
 
     def start(self, focal_px: float | None, scale: int) -> np.ndarray:
         """A state from each view alone; of several focal lengths the one that fits best."""
