@@ -1,6 +1,6 @@
 """VisDom GS: the best we know of for Gaussians from 4 to 12 photographs.
 
-It is `3dgs-go+vd` with four switches on; L_i on every second step pays for the virtual views. FINDINGS.md has what
+It is `3dgs-go+vd` with five switches on; L_i on every second step pays for the virtual views. FINDINGS.md has what
 was tried on the way.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from method_configs import gs_go
+from visdom_plugin.hull.inside.config import InsideConfig
 from visdom_plugin.methods.splats.configs import GsGoConfig
 from visdom_plugin.registry import MethodSpec
 
@@ -18,7 +19,8 @@ PAPER = gs_go.SPEC.presets()["3dgs-go+vd"]
 def improve(paper: GsGoConfig) -> GsGoConfig:
     """The paper's settings with the switches on."""
     vd = replace(paper.vd, points="shell", every=2)
-    return replace(paper, initial_shape="inside", vd=vd, virtual_weight=0.2, dropout=0.2)
+    inside = InsideConfig(photo_weight=0.15)
+    return replace(paper, initial_shape="inside", inside=inside, vd=vd, virtual_weight=0.2, dropout=0.2)
 
 
 QUICK, FULL = (improve(config) for config in (PAPER.quick, PAPER.full) if isinstance(config, GsGoConfig))

@@ -18,7 +18,7 @@ from visdom_plugin.hull.inside.photo_consistency import PhotoConsistency
 from visdom_plugin.hull.inside.shape import shape_inside
 
 BALLS = [((0.0, 0.0, 0.0), 0.8), ((0.7, 0.3, 0.5), 0.4)]
-ON = InsideConfig(photo_weight=0.2)
+ON = InsideConfig(photo_weight=0.2, photo_tolerance=0.2)
 
 
 def capture(views=5):
@@ -49,7 +49,7 @@ def test_photographs_that_disagree_carve_and_every_mask_stays_covered():
     cameras, masks, hull = capture()
     sizes = []
     for weight in (0.0, 0.1, 0.3):
-        config = InsideConfig(photo_weight=weight)
+        config = InsideConfig(photo_weight=weight, photo_tolerance=0.2)
         inner = shape_inside(hull, cameras, masks, (), config, painted(masks, CHECKED))
         sizes.append(inner.voxels)
         assert not (inner.occupancy & ~hull.occupancy).any()

@@ -40,7 +40,7 @@ class InsideConfig:
     photo_weight: float = 0.0
     """How much of a voxel's surroundings must speak for it beyond half, where the photographs that see it show
     different colours; 0 leaves the shape to the silhouettes. Needs the photographs."""
-    photo_tolerance: float = 0.2
+    photo_tolerance: float = 0.3
     """Standard deviation of such colours, of 1, at which 1 - 1/e of that is asked."""
 
     def __post_init__(self) -> None:
@@ -58,4 +58,4 @@ class InsideConfig:
         if not 0 <= self.photo_weight <= 0.5:
             refuse(f"photo_weight is {self.photo_weight}", "use 0 to 0.5, such as 0.15")
         if not 0 < self.photo_tolerance < float("inf"):
-            refuse(f"photo_tolerance is {self.photo_tolerance}", "use a positive number, such as 0.2")
+            refuse(f"photo_tolerance is {self.photo_tolerance}", "use a positive number, such as 0.3")
