@@ -8,7 +8,7 @@ import torch
 
 from tests.training import fake
 from visdom_plugin.errors import SceneError
-from visdom_plugin.geometry.camera_paths import framed, orbit, resample
+from visdom_plugin.geometry.camera_paths import framed, orbit, resample, widen
 from visdom_plugin.geometry.cameras import project
 from visdom_plugin.geometry.path_files import NERFSTUDIO, read_path, write_path
 from visdom_plugin.geometry.rotations import matrix_from_quaternion
@@ -127,3 +127,15 @@ def test_another_size_keeps_the_view_from_top_to_bottom(capture):
         project(both, points)[0], 2 * (before - centre) + 2 * centre * before.new_tensor([2, 1])
     )
     assert framed(capture, None, None) is capture
+
+
+def test_a_wider_view_has_all_points_and_no_more_than_it_must(capture):
+    circle = orbit(capture, 12, torch.zeros(3))
+    points = torch.randn(200, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) * 0.6
+    size = circle.width[0].double(), circle.height[0].double()
+    wide = widen(circle, points)
+    uv, _ = project(wide, points)
+    inside = [(uv[..., a] / size[a] - 0.5).abs().max() for a in range(2)]
+    assert max(inside) == pytest.approx(0.475, abs=1e-6)
+    # What is in the picture anyway stays as large as it is.
+    assert torch.equal(widen(circle, 0.001 * points).intrinsics, circle.intrinsics)

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.geometry.cameras import Cameras, look_at_point, project
 from visdom_plugin.geometry.rotations import slerp
 
 
@@ -108,6 +108,28 @@ def orbit(cameras: Cameras, count: int, look_at: Tensor | None = None) -> Camera
     return Cameras(
         one.intrinsics.expand(count, 3, 3), motion, one.width.expand(count), one.height.expand(count)
     )
+
+
+def widen(cameras: Cameras, points: Tensor, margin: float = 0.05) -> Cameras:
+    """Cameras (N,) with shorter focal lengths where that is needed to have points (P, 3) in their pictures.
+
+    All are shortened by the same factor.
+
+    Args:
+        margin: share of the picture's half that stays free beside them.
+    """
+    K = cameras.intrinsics
+    uv, depth = project(cameras, points.to(cameras.world_from_camera))
+    centre = K[:, None, :2, 2]
+    size = torch.stack([cameras.width, cameras.height], -1)[:, None]
+    # How far a point lies on its way from the principal point to the picture's border.
+    share = torch.where(uv > centre, (uv - centre) / (size - centre), (centre - uv) / centre).amax(-1)
+    farthest = float(share[depth > 0].amax()) if bool((depth > 0).any()) else 0.0
+    factor = min(1.0, (1 - margin) / max(farthest, 1e-9))
+    wider = K.clone()
+    wider[:, 0, 0] *= factor
+    wider[:, 1, 1] *= factor
+    return Cameras(wider, cameras.world_from_camera, cameras.width, cameras.height)
 
 
 def resample(cameras: Cameras, count: int, look_at: Tensor) -> Cameras:

@@ -13,8 +13,9 @@ import torch
 
 from visdom_plugin.atomic_files import write_bytes, write_json
 from visdom_plugin.figures.contact_sheet import colour_depth, draw_error, shown_on_sheet, to_bytes
-from visdom_plugin.geometry.camera_paths import orbit
+from visdom_plugin.geometry.camera_paths import orbit, widen
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.seeding import generator
 from visdom_plugin.training.evaluate import draw_truth, hull_silhouette
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ SHOWN, INPUTS = 4, 12
 """Views with all their pictures, and training views shown small, at most."""
 _WIDTH, _SMALL, _ORBIT = 480, 240, 240
 _FRAMES = 24
+_SEEN = 1000
+"""Points of the hull that pictures from all round show."""
 _SECONDS = 10.0
 """What the orbit may take: where it would take longer, its pictures are smaller."""
 _MASK, _HULL = (255, 170, 0), (0, 170, 230)
@@ -121,6 +124,8 @@ def _keep_orbit(folder: Path, run: Finished, rate: float) -> dict[str, Any]:
     height = max(1, round(width * aspect))
     centre = look_at_point(cameras) if run.hull is None else torch.as_tensor(run.hull.centre)
     circle = orbit(cameras, _FRAMES, centre)
+    if run.hull is not None:
+        circle = widen(circle, run.hull.sample_points(_SEEN, generator(0, "orbit")))
     frames = [
         to_bytes(_draw(run, circle[i].resized(width, height)).rgb.detach().cpu()) for i in range(_FRAMES)
     ]

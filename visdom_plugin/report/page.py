@@ -118,7 +118,10 @@ def _run(n: int, run: Reported, folder: Path) -> dict[str, Any]:
         ("views", f"{len(reading['train'])} for training, {len(reading['test'])} for testing"),
         ("size", f"reduced by {reading['downscale']:g}" if reading.get("downscale", 1) != 1 else "as it is"),
         ("budget, seed", f"{record.get('budget') or 'not noted'}, {record['seed']}"),
-        ("device", f"{record.get('device')}, {record.get('threads')} threads"),
+        (
+            "device",
+            f"{record.get('device')}, {record.get('threads')} thread{'s' * (record.get('threads') != 1)}",
+        ),
         *([("Gaussians", f"{data['points']['gaussians']:,}")] if data["points"] else []),
     ]
     if "train_s" in timing:
@@ -131,6 +134,8 @@ def _run(n: int, run: Reported, folder: Path) -> dict[str, Any]:
         "colour": pen(n)[0],
         "facts": facts,
         "command": data["command"],
+        # A line may end between an option and the next, not within one.
+        "words": data["command"].split(" "),
         "findings": data["findings"],
         "hull": data["hull"],
         "inputs": [

@@ -274,9 +274,10 @@ def cameras_along(
     """
     import torch
 
-    from visdom_plugin.geometry.camera_paths import orbit, resample
+    from visdom_plugin.geometry.camera_paths import orbit, resample, widen
     from visdom_plugin.geometry.cameras import look_at_point
     from visdom_plugin.geometry.path_files import read_path
+    from visdom_plugin.seeding import generator
 
     if path in ("train", "test"):
         views = scene.train if path == "train" else scene.test
@@ -286,7 +287,10 @@ def cameras_along(
     cameras, fps = scene.train.cameras, None
     centre = look_at_point(cameras) if hull is None else torch.as_tensor(hull.centre)
     if path == "orbit":
-        return orbit(cameras, frames or FRAMES, centre), None
+        circle = orbit(cameras, frames or FRAMES, centre)
+        if hull is not None:
+            circle = widen(circle, hull.sample_points(1000, generator(0, "orbit")))
+        return circle, None
     if isinstance(path, Path):
         cameras, fps = read_path(path, cameras)
         if frames is None:
