@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from glob import escape
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -74,7 +75,7 @@ def choose_files(capture: Capture, request: Request) -> Chosen:
     else:
         split = choose_named(capture.root, names, request)
     wanted = [*split.train, *split.test]
-    _refuse_absent(capture.root, [asked[i] for i in wanted if found[i] is None])
+    _refuse_absent(there, [asked[i] for i in wanted if found[i] is None])
     masks = assign_masks(capture, wanted, request)
     ignored = find_ignored(capture, wanted, request)
     files = [
@@ -229,15 +230,25 @@ def _without(pools: Pools, absent: Sequence[int], count: int) -> Pools:
     return Pools(train, test, pools.rule)
 
 
-def _refuse_absent(root: Path, absent: Sequence[str]) -> None:
-    if absent:
+def _refuse_absent(there: ImageFiles, absent: Sequence[str]) -> None:
+    if not absent:
+        return
+    what = f"{len(absent)} of the photographs that are asked for are missing"
+    path = there.root / absent[0]
+    other = next(path.parent.glob(f"{escape(path.stem)}.*"), None) if path.parent.is_dir() else None
+    if other is not None:
         raise SceneError(
-            f"{len(absent)} of the photographs that are asked for are missing: "
-            f"{list_some([printable(name) for name in absent])}",
-            where=root / absent[0],
-            cause="the scene was copied only in part, or the photographs were renamed",
-            todo="copy them there, or list only views that have one, with --train-list and --test-list",
+            f"{what}; there is {printable(other.name)}",
+            where=path,
+            cause=f"photographs in a format that is not read, {printable(other.suffix)}",
+            todo="convert them to PNG or JPEG",
         )
+    raise SceneError(
+        f"{what}: {list_some([printable(name) for name in absent])}",
+        where=path,
+        cause="the scene was copied only in part, or the photographs were renamed",
+        todo="copy them there, or list only views that have one, with --train-list and --test-list",
+    )
 
 
 def _files(frame: Frame, image: str, mask: str | None, ignored: str | None, there: ImageFiles) -> Frame:

@@ -67,6 +67,9 @@ _ELSEWHERE = {
 """Files by which neighbouring programs' captures are known, and what to do with them."""
 
 
+_MOST_FOLDERS = 200
+
+
 def load(
     path: str | Path | None,
     *,
@@ -217,10 +220,16 @@ def _only_reading(root: Path) -> str:
 
 
 def _guess(root: Path) -> str:
-    inside = [p for p in sorted(root.iterdir()) if p.is_dir()]
-    for folder in inside:
+    from datamodules.files.images import ENDINGS  # with NumPy and Pillow, which --help need not wait for
+
+    for folder in _folders_below(root, 3):
         if recognise(folder):
-            return f"one level too high: {folder} looks like a scene"
+            if any(p.suffix.lower() in ENDINGS for p in folder.rglob("*")):
+                levels = ("one level", "two levels", "three levels")[len(folder.relative_to(root).parts) - 1]
+                return f"{levels} too high: {folder} looks like a scene"
+            return (
+                f"poses lie in {folder.relative_to(root).as_posix()}, without photographs: put both together"
+            )
     if root.name in ("images", "masks", "sparse", "0", "rgbs", "matting"):
         return "one level too deep: the scene is the folder above"
     for name, meaning in _ELSEWHERE.items():
@@ -229,3 +238,12 @@ def _guess(root: Path) -> str:
     return (
         "it holds none of the files that the layouts are known by" if any(root.iterdir()) else "it is empty"
     )
+
+
+def _folders_below(root: Path, depth: int) -> Iterator[Path]:
+    """Folders below, the nearer first; of many only the first."""
+    level = [root]
+    for _ in range(depth):
+        level = [p for folder in level for p in sorted(folder.iterdir()) if p.is_dir() and p.name[0] != "."]
+        level = level[:_MOST_FOLDERS]
+        yield from level

@@ -9,7 +9,7 @@ from datamodules.files.paths import printable, read_plain
 from visdom_plugin.errors import SceneError
 
 FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
-_PLACES = ("sparse", "colmap/sparse", "colmap_sparse", "dense/sparse", "")
+_PLACES = ("sparse", "colmap/sparse", "colmap_sparse", "dense/sparse", "distorted/sparse", "")
 """Folders that hold a model, or one model per numbered folder; what comes first is preferred."""
 
 

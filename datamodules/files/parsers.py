@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,9 +18,14 @@ import numpy as np
 from visdom_plugin.errors import SceneError
 
 
-def damaged(path: Path, what: str, cause: str = "the file is truncated or damaged") -> NoReturn:
+def damaged(
+    path: Path,
+    what: str,
+    cause: str = "the file is truncated or damaged",
+    todo: str = "copy the file again or export it again",
+) -> NoReturn:
     """Raises SceneError about a file."""
-    raise SceneError(what, where=path, cause=cause, todo="copy the file again or export it again")
+    raise SceneError(what, where=path, cause=cause, todo=todo)
 
 
 def parse_json(data: bytes, path: Path) -> dict[str, Any]:
@@ -52,6 +58,11 @@ def number(value: Any, what: str, path: Path) -> float:
     Raises:
         SceneError: for anything else.
     """
+    if isinstance(value, str) and re.fullmatch(
+        r"\s*[-+]?[\d.]+(e[-+]?\d+)?\s*", value, re.ASCII | re.IGNORECASE
+    ):
+        todo = f"write it without quotes: {value.strip():.30}"
+        damaged(path, f"{what} is a text, {value[:40]!r}, not a number", "a number in quotes", todo)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         damaged(
             path, f"{what} is {_shown(value)}, not a finite number", cause="a damaged or wrongly written file"

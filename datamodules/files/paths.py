@@ -16,6 +16,7 @@ MOST_BYTES = 2**31
 """No single file of a scene is larger; its bytes are held in memory while it is read."""
 _LONGEST_NAME, _LONGEST_PATH = 220, 3000
 """File systems stop at 255 bytes and 4096; the rest is for the endings of masks and side files."""
+_POINTER = b"version https://git-lfs.github.com/spec/"
 _OPTION = "pass --allow-outside if you trust this data"
 
 
@@ -78,6 +79,7 @@ def read_plain(path: Path, most: int = MOST_BYTES) -> bytes:
 
     Raises:
         OSError: it is missing, may not be read, is not a plain file, or is larger.
+        SceneError: it stands for a file that was not fetched.
     """
     # Opening a pipe would wait for its writer.
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
@@ -88,9 +90,17 @@ def read_plain(path: Path, most: int = MOST_BYTES) -> bytes:
         if status.st_size > most:
             raise OSError(0, f"it has {status.st_size} bytes; at most {most} are read")
         with open(handle, "rb", closefd=False) as file:
-            return file.read(status.st_size)
+            data = file.read(status.st_size)
     finally:
         os.close(handle)
+    if data.startswith(_POINTER):
+        raise SceneError(
+            f"{printable(path.name)} is a pointer of Git LFS, not the file itself",
+            where=path,
+            cause="a repository cloned without Git LFS, or downloaded as an archive",
+            todo="git lfs install && git lfs pull, in the repository",
+        )
+    return data
 
 
 def read_file(path: Path, most: int = MOST_BYTES) -> bytes:

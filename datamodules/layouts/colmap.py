@@ -22,6 +22,7 @@ from datamodules.files.find_model import choose_model, find_model
 from datamodules.files.paths import check_name, stem
 from datamodules.request import Request
 from datamodules.views import splits
+from datamodules.views.find_files import ImageFiles, localise, note_localised
 from visdom_plugin.errors import SceneError
 
 log = logging.getLogger(__name__)
@@ -78,13 +79,20 @@ def read_capture(
         log.log(logging.INFO if folder == find_model(root) else logging.WARNING, "%s: %s", root, line)
     model = colmap_model.read_model(root, folder, outside=request.allow_outside)
     points = find_points(root, folder)
-    for image in model.images:
-        check_name(image.name, model.folder, outside=request.allow_outside)
-    registered = {image.name: image for image in model.images}
+    there, names = ImageFiles(root), [image.name for image in model.images]
+    if not request.allow_outside:
+        found = [localise(there, name) for name in names]
+        said += note_localised(names, found)
+        names = [
+            new.removeprefix("images/") if new != old else new for new, old in zip(found, names, strict=True)
+        ]
+    for name in names:
+        check_name(name, model.folder, outside=request.allow_outside)
+    registered = dict(zip(names, model.images, strict=True))
     frames = sort_frames(
         [
             Frame(name, f"images/{name}", depth=None if depths is None else f"{depths}/{stem(name)}.png")
-            for name in (image.name for image in model.images)
+            for name in names
         ]
     )
 

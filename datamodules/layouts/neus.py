@@ -23,6 +23,7 @@ from datamodules.files.paths import check_name, inside, printable, read_file, re
 from datamodules.files.pinholes import pinholes
 from datamodules.request import Request
 from datamodules.views import splits
+from datamodules.views.mask_files import OTHER_FOLDERS
 from visdom_plugin.errors import SceneError
 
 _FILES = ("cameras_sphere.npz", "cameras_large.npz", "cameras.npz")
@@ -53,7 +54,8 @@ def read(root: Path, request: Request) -> Capture:
             cause="the copy is not complete, or photographs were added or left out",
             todo="keep exactly the photographs that the matrices were made for, in the order of their names",
         )
-    mask_folder = next((name for name in ("mask", "masks") if (root / name).is_dir()), "mask")
+    places = [request.masks] if request.masks else ["mask", "masks", *OTHER_FOLDERS]
+    mask_folder = next((name for name in places if (root / name).is_dir()), "mask")
     masks = _list_images(root, mask_folder, request)
     # DTU's masks are 000.png for photographs 000000.png: their order tells.
     ordered = len(masks) == len(photographs)

@@ -28,12 +28,14 @@ from datamodules.files.pinholes import pinholes
 from datamodules.files.undistort import FISHEYES, Distortion
 from datamodules.request import Request
 from datamodules.views import splits
-from datamodules.views.find_files import ImageFiles
+from datamodules.views.find_files import ImageFiles, localise, note_localised
 from visdom_plugin.errors import SceneError, list_some
 
 _MATRICES = ("intrinsic_matrix", "intrinsics", "intrinsic", "K", "camera_intrinsics")
 """Names under which other programs give a 3 x 3 or 4 x 4 matrix of intrinsics in pixels."""
 _LENS = ("x_fov", "y_fov", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy", "sk_x")
+_LEAST_FOV = 2.5
+"""Degrees; no smaller angle of view is believed, as it would be a wide one in radians."""
 _BENT = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
@@ -154,15 +156,34 @@ def _entry(frame: Any, index: int, content: dict[str, Any], path: Path) -> Entry
 def _lens_numbers(scope: dict[str, Any], what: str, path: Path) -> dict[str, float]:
     """Numbers of the lens that a frame gives, or the file for all; a matrix of intrinsics as fl_x and so on."""
     found = {key: number(scope[key], key, path) for key in _LENS if scope.get(key) is not None}
+    for key in _LENS:
+        if key.startswith("camera_angle") and found.get(key, 0) >= math.pi:
+            degrees, radians = found[key], math.radians(found[key])
+            damaged(
+                path,
+                f"{key} of {what} is {degrees:g}, more than half a turn",
+                "an angle in degrees: this key is in radians",
+                f"write {radians:.6g}" if degrees < 180 else "give fl_x and fl_y in pixels",
+            )
+        if key.endswith("_fov") and 0 < found.get(key, 9) < _LEAST_FOV:
+            cause = "an angle in radians: this key is in degrees"
+            damaged(
+                path, f"{key} of {what} is {found[key]:g}", cause, f"write {math.degrees(found[key]):.6g}"
+            )
     for key in _MATRICES:
         if scope.get(key) is not None:
             rows = scope[key] if isinstance(scope[key], list) else []
+            if len(rows) in (9, 16) and not any(isinstance(x, list) for x in rows):
+                edge = math.isqrt(len(rows))
+                rows = [rows[i : i + edge] for i in range(0, len(rows), edge)]
+            form = "write it by rows, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, or fl_x, fl_y, cx, cy"
             if len(rows) not in (3, 4) or any(not isinstance(r, list) or len(r) not in (3, 4) for r in rows):
                 damaged(
-                    path,
-                    f"{key} of {what} is no 3 x 3 or 4 x 4 matrix",
-                    cause="a wrongly written file",
+                    path, f"{key} of {what} is no 3 x 3 or 4 x 4 matrix", "another program's dialect", form
                 )
+            if [number(x, key, path) for x in rows[2][:3]] != [0, 0, 1]:
+                cause = "a matrix written by columns, or scaled"
+                damaged(path, f"the third row of {key} of {what} is {rows[2][:3]}, not 0 0 1", cause, form)
             (fx, skew, cx), (_, fy, cy) = ([number(x, key, path) for x in row[:3]] for row in rows[:2])
             found |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "sk_x": skew}
     skew = found.pop("sk_x", 0.0)
@@ -229,14 +250,19 @@ def make_capture(
     """
     of_name: dict[str, tuple[Transforms, Entry, int]] = {}
     frames, there = [], ImageFiles(root)
+    said: list[str] = []
     for part, file in enumerate(files):
-        for entry in file.entries:
+        entries = file.entries
+        if rename is None and not request.allow_outside:
+            entries = tuple(_localise(there, entry) for entry in entries)
+            said += note_localised([e.file_path for e in file.entries], [e.file_path for e in entries])
+        for entry in entries:
             check_name(entry.file_path, file.path, outside=request.allow_outside or rename is not None)
             name = rename(entry.file_path) if rename else _find_photograph(there, entry.file_path)
             of_name[name] = file, entry, part
             frames.append(_frame(root, name, entry, request))
     ordered = sort_frames(frames)
-    pools, notes = _pools(ordered, of_name, files), []
+    pools, notes = _pools(ordered, of_name, files), said
     if any(frame.ignore for frame in ordered):
         notes.append("mask_path means pixels to ignore, as in nerfstudio, not the object's outline")
     # mask_path may point into the folder masks: these files are then no foreground masks.
@@ -266,6 +292,16 @@ def make_capture(
         mask_folder=None if pointed else "masks",
         notes=tuple(notes),
     )
+
+
+def _localise(there: ImageFiles, entry: Entry) -> Entry:
+    """The entry with paths of another machine as they are found below the folder."""
+    path = entry.file_path
+    if PurePosixPath(path).suffix.lower() not in images.ENDINGS:
+        found = localise(there, f"{path}.png")
+        path = path if found == f"{path}.png" else found
+    mask, depth = (p and localise(there, p) for p in (entry.mask_path, entry.depth_path))
+    return replace(entry, file_path=localise(there, path), mask_path=mask, depth_path=depth)
 
 
 def _find_photograph(there: ImageFiles, file_path: str) -> str:

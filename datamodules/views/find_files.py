@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import unicodedata
 from collections import defaultdict
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 from datamodules.files.images import ENDINGS
+
+log = logging.getLogger(__name__)
 
 _MOST_FILES = 200_000
 _NO_PHOTOGRAPHS = (
@@ -74,6 +78,35 @@ class ImageFiles:
                 shared[common].append(file)
         best = shared[max(shared)] if shared else []
         return best[0] if len(best) == 1 else None
+
+
+def localise(there: ImageFiles, name: str) -> str:
+    """The path below the folder of a file that the data names by a path of another folder or machine.
+
+    Such a path is absolute, also on Windows, or climbs out. It stays where nothing below ends like it, and where
+    it exists as it is.
+    """
+    parts = name.replace("\\", "/").split("/") if "\\" in name else name.split("/")
+    drive = len(parts[0]) == 2 and parts[0].endswith(":")
+    straight = os.path.normpath(name) if ".." in parts else name
+    if straight[0] not in "./" and (there.root / straight).exists():
+        return straight
+    foreign = drive or parts[0] == "" or ".." in parts or "\\" in name
+    if not foreign or not name.isprintable() or (there.root / name).exists():
+        return name
+    below = "/".join(part for part in parts[drive:] if part not in ("", ".", ".."))
+    return (there.find(below) if below else None) or name
+
+
+def note_localised(names: Sequence[str], found: Sequence[str]) -> list[str]:
+    """The note on names that `localise` changed; none where it changed none."""
+    changed = [(old, new) for old, new in zip(names, found, strict=True) if old != new]
+    if not changed:
+        return []
+    old, new = changed[0]
+    note = f"{len(changed)} of {len(names)} photographs are named by paths of another folder: {new} for {old}"
+    log.warning("%s", note)
+    return [note]
 
 
 def _folders(name: str) -> list[str]:

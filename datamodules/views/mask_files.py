@@ -22,10 +22,10 @@ from visdom_plugin.errors import SceneError, list_some
 
 log = logging.getLogger(__name__)
 
-_OTHER_FOLDERS = (
+OTHER_FOLDERS = (
     "mask", "matting", "mattings", "matte", "mattes", "alpha", "alphas", "silhouette", "silhouettes",
     "segmentation", "segmentations", "foreground", "object_mask", "object_masks", "image_mask", "images_mask",
-    "image_masks", "images_masks", "mask_images", "masks_png",
+    "image_masks", "images_masks", "mask_images", "masks_png", "mask_png", "sam_masks", "rembg",
 )  # fmt: skip
 """Names under which folders of masks are known elsewhere."""
 
@@ -74,7 +74,7 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> M
     shift = 0 if any(affix) else _find_shift((name for names in photographs for name in names), there)
     if (missing or shift) and not request.allow_missing_masks:
         missing = missing or [i for i in range(len(photographs)) if i not in found]
-        hint = f"there are masks that no image has: {list_some(extra)}" if extra else None
+        hint = f"there are masks that no image has: {list_some(extra)}" if extra else _strange_files(path)
         reason = f"the masks' numbers are shifted by {shift}" if shift else "masks named otherwise"
         looked = " or ".join(f"{folder}/{printable(stem(name))}.png" for name in photographs[missing[0]])
         raise SceneError(
@@ -128,7 +128,7 @@ def _find_folder(
         )
     others = []
     for path in sorted(capture.root.iterdir()):
-        if path.name.lower() in _OTHER_FOLDERS and path.name != folder and path.is_dir():
+        if path.name.lower() in OTHER_FOLDERS and path.name != folder and path.is_dir():
             matched, _ = _match(photographs, _image_files(path))
             if all(len(matched.get(i, ())) == 1 for i in wanted):
                 others.append(path.name)
@@ -189,6 +189,14 @@ def _match(
 
 def _fold(start: str) -> str:
     return loose_key(f"{start}.png")
+
+
+def _strange_files(path: Path) -> str | None:
+    """What lies in a folder of masks that is no image."""
+    strange = sorted(p.name for p in path.iterdir() if p.is_file() and p.suffix.lower() not in ENDINGS)
+    return (
+        f"it holds {list_some(map(printable, strange), 3)}, which are read as no image" if strange else None
+    )
 
 
 def looks_inverted(mask: Tensor) -> bool:

@@ -21,6 +21,7 @@ from visdom_plugin.scene import NO_MASKS
 
 ChooseTurns = Callable[[], tuple[int, bool]]
 """For files that fit their photograph turned and not: which way most do, and whether that is clear."""
+_MASK_WORDS = ("mask", "matte", "alpha", "seg", "segmentation", "silhouette")
 
 
 class FoundMask(NamedTuple):
@@ -124,6 +125,13 @@ def refuse_unmasked(reading: Reading, file: Frame, photo: Photograph) -> None:
     if source != "folder":
         lacks.append("its alpha channel is opaque everywhere" if photo.alpha else "it has no alpha channel")
     others = _other_folders(reading.root, file)
+    if beside := _beside(photo.path):
+        raise SceneError(
+            f"the photograph {printable(file.name)} has no foreground mask: {', and '.join(lacks)}",
+            where=photo.path,
+            cause=f"masks among the photographs: {printable(beside.name)} is one by its name",
+            todo=f"move such files to {folder or 'masks'}/",
+        )
     raise SceneError(
         f"the photograph {printable(file.name)} has no foreground mask: {', and '.join(lacks)}",
         where=reading.root if missing else photo.path,
@@ -132,6 +140,15 @@ def refuse_unmasked(reading: Reading, file: Frame, photo: Photograph) -> None:
         if others
         else NO_MASKS,
     )
+
+
+def _beside(path: Path) -> Path | None:
+    """A file in the photograph's folder that is called like a mask of it."""
+    names = [f"{path.stem}{link}{word}" for link in "_-." for word in _MASK_WORDS]
+    names += [f"{word}{link}{path.stem}" for link in "_-." for word in _MASK_WORDS]
+    wanted = {loose_key(f"{name}.png") for name in names}
+    found = (p for p in sorted(path.parent.iterdir()) if p.suffix.lower() in images.ENDINGS)
+    return next((p for p in found if loose_key(p.name) in wanted), None)
 
 
 def _other_folders(root: Path, file: Frame) -> list[str]:

@@ -79,3 +79,13 @@ def test_common_cameras_are_not_asked():
     cameras = Cameras.from_matrices(K, np.eye(4)[None], width=800, height=600)
     assert not may_be_other_units(cameras)
     assert may_be_other_units(cameras.resized(100, 75))
+
+
+def test_fractions_are_no_angles():
+    """What is normalised is said to be that, all of it."""
+    cameras, masks = _capture((F, F))
+    K = cameras.intrinsics / torch.tensor([[W], [H], [1]])
+    normalised = Cameras(K, cameras.world_from_camera, cameras.width, cameras.height)
+    (found,) = (f for f in check(normalised, masks).findings if f.sure == "certain")
+    assert found.kind == "principal" and "so are fx and fy" in found.todo
+    assert not may_be_other_units(normalised)

@@ -17,8 +17,8 @@ from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines
 from visdom_plugin.hull.checks.findings import Finding, Sure
 from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
 
-LARGEST_ANGLE, LARGEST_MM = 170.0, 600.0
-"""Focal lengths up to these may be degrees, or millimetres."""
+LEAST, LARGEST_ANGLE, LARGEST_MM = 5.0, 170.0, 600.0
+"""Focal lengths from the first on and up to the others may be degrees, or millimetres."""
 _FULL_FRAME_MM = 36.0
 _WIDE_DEGREES = 100.0
 _MIDDLE = 0.25
@@ -114,6 +114,7 @@ def find_astray(cameras: Cameras) -> Finding | None:
         "certain" if normalised else "likely",
         float(out.mean()),
         "multiply cx by the width and cy by the height: they are normalised"
+        + (", and so are fx and fy" if cameras.intrinsics[..., 0, 0].double().median() < 4 else "")
         if normalised
         else "give cx and cy in pixels from the image's upper left corner, and scale them with the images",
     )
@@ -135,6 +136,8 @@ def _same_shape(focal: np.ndarray, size: np.ndarray) -> bool:
 
 def _readings(focal: np.ndarray, size: np.ndarray) -> Iterator[_Reading]:
     """Other units that focal lengths (N, 2) for images of size (N, 2) could be in."""
+    if focal.min() < LEAST:
+        return
     degrees = "an angle of view in degrees across the "
     if focal.max() <= LARGEST_ANGLE:
         half = np.tan(np.radians(focal) / 2)
