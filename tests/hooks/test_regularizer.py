@@ -98,13 +98,13 @@ def test_views_of_the_bank_are_the_same_in_every_process(ball):
     first, second = (VisDomGaussianRegularizer(hull, cameras, bank=5) for _ in range(2))
     seen = set()
     for seed in range(40):
-        views = [hook._draw(None, 0, torch.Generator().manual_seed(seed)) for hook in (first, second)]
+        views = [hook._draw(torch.Generator().manual_seed(seed)) for hook in (first, second)]
         assert torch.equal(views[0][0].world_from_camera, views[1][0].world_from_camera)
         assert torch.equal(views[0][1], depth_and_silhouette(hull, views[1][0])[1])
         seen.add(tuple(views[0][0].centres.tolist()))
     assert len(seen) == 5
     fresh = VisDomGaussianRegularizer(hull, cameras, bank=0)
-    assert len({tuple(fresh._draw(None, 0, None)[0].centres.tolist()) for _ in range(8)}) == 8
+    assert len({tuple(fresh._draw(None)[0].centres.tolist()) for _ in range(8)}) == 8
 
 
 def test_midpoint_views_all_have_their_turn_before_any_has_another(ball):

@@ -240,7 +240,7 @@ class VisDomGaussianRegularizer:
             return {}
         losses = []
         for i in range(self.config.views_per_step):
-            camera, mask = self._draw(step, i, generator)
+            camera, mask = self._draw(generator, step, i)
             alpha = _opacity(render(camera), mask.shape)
             losses.append(outside_loss(alpha, mask.to(alpha.device)))
         return {"visdom_outside": self.config.weight / len(losses) * sum(losses[1:], losses[0])}
@@ -258,7 +258,9 @@ class VisDomGaussianRegularizer:
         return c.weight > 0 and step >= c.start and (step - c.start) % c.every == 0
 
     @_outside_graphs
-    def _draw(self, step: int | None, i: int, generator: Generator | None) -> tuple[Cameras, Tensor]:
+    def _draw(
+        self, generator: Generator | None, step: int | None = None, i: int = 0
+    ) -> tuple[Cameras, Tensor]:
         """The i-th view of a step and the hull's silhouette in it, (H, W) bool."""
         if not self.config.bank and not self._midpoints:
             camera = self.sample_camera(generator)
