@@ -168,7 +168,9 @@ def test_people_can_use_the_page(fakes):
         for width in (320, 420, 1600):
             page.size(width, 800)
             assert page.run("document.documentElement.scrollWidth <= innerWidth"), width
+        assert page.run("getComputedStyle(document.querySelector('.paper')).display") == "none"
         page.call("Emulation.setEmulatedMedia", media="print")
+        assert page.run("getComputedStyle(document.querySelector('.paper')).display") == "block"
         assert page.run("getComputedStyle(document.querySelector('.slider')).display") == "none"
         assert page.run("getComputedStyle(document.querySelector('.over')).position") == "static"
         assert page.errors == []

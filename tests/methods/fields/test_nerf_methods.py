@@ -217,6 +217,14 @@ def test_a_mesh_of_a_known_field_is_its_surface_whatever_the_resolution():
         assert abs(torch.from_numpy(rgb) / 255 - (0.8 * local + 0.5)).max() < 0.01
     assert mesh_density(lambda p: torch.zeros(len(p)), colour_of, frame, 1.0) is None
 
+    def hollow(points):
+        return density_of(points) * ((points - centre).norm(dim=-1) > 0.15)
+
+    vertices, faces, _ = mesh_density(hollow, colour_of, frame, 1.0, resolution=64)
+    assert trimesh.Trimesh(vertices, faces).body_count == 1
+    local = (torch.from_numpy(vertices) - frame.centre) * frame.scale
+    assert ((local - centre).norm(dim=-1) - 0.3).abs().max() < 0.03
+
 
 @METHODS
 def test_seeds_repeat_and_differ(method_class, scene, hull):

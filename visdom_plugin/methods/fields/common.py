@@ -149,7 +149,7 @@ def mesh_density(
     smallest_piece: float = 0.01,
     chunk: int = 1 << 17,
 ) -> FieldMesh | None:
-    """The surface where the field is half opaque over a thirtieth of the object, by marching cubes.
+    """The outer surface where the field is half opaque over a thirtieth of the object, by marching cubes.
 
     Whatever the resolution, the level is the same. A coarse look at the whole cube finds the object's box.
 
@@ -164,7 +164,7 @@ def mesh_density(
     Returns:
         The mesh in the capture's frame; None where nothing is opaque.
     """
-    from scipy.ndimage import label
+    from scipy.ndimage import binary_fill_holes, label
     from skimage.measure import marching_cubes
     from trimesh import Trimesh
 
@@ -194,7 +194,11 @@ def mesh_density(
     values = sample(lower, step, np.ceil((upper - lower) / step).astype(int))
     level = math.log(2) / (extent / 30)
     small = (values > level) & ~main_pieces(values > level)
-    values = np.pad(np.where(small, 0, values), 1)
+    values = np.where(small, 0, values)
+    # Hollows that nobody can look into have no surface.
+    solid = values > level
+    values = np.where(binary_fill_holes(solid) & ~solid, values.max(), values)
+    values = np.pad(values, 1)
     if not values.max() > level:
         return None
     # The logarithm of an exponential field is close to linear between voxels. Skimage's "ascent" faces outwards.
