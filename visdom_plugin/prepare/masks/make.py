@@ -145,7 +145,7 @@ def _start(inside: np.ndarray, unlike: np.ndarray | None) -> np.ndarray:
     labels[inside] = LIKELY_BACKGROUND
     labels[inside & other] = OBJECT
     # Far from anything that differs, the plane is seen: markers' colours teach the background.
-    about = cv2.dilate(other.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    about = cv2.dilate(other.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     labels[inside & ~about & (np.nan_to_num(unlike, nan=np.inf) < _SAME)] = BACKGROUND
     return labels
 

@@ -16,9 +16,11 @@ from visdom_plugin.geometry.cameras import Cameras
 
 LEAST_VIEWS = 4
 """Views needed: fewer do not outvote the object."""
-_MAP_PX = 800
-_REACH = 4.0
-"""Side of the map in longest sides of the box."""
+_MAP_PX = 640
+_REACHES = (3.0, 12.0)
+"""Sides of a fine and a coarse map, in longest sides of the box: low views look far past the object."""
+_UNSURE = 8.0
+"""Median difference between views, in Lab, from which a place of the plane is not known."""
 _MOST_VIEWS = 16
 _NEAR = 1e-3
 _WINDOW = 5
@@ -39,7 +41,13 @@ def differences(cameras: Cameras, images: Sequence[np.ndarray], box: np.ndarray)
     import cv2
 
     lab = [cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB) for image in images]
-    side = _REACH * float((box[1] - box[0]).max())
+    fine, coarse = (_differ(cameras, lab, box, reach) for reach in _REACHES)
+    return [np.where(np.isnan(f), c, f) for f, c in zip(fine, coarse, strict=True)]
+
+
+def _differ(cameras: Cameras, lab: Sequence[np.ndarray], box: np.ndarray, reach: float) -> list[np.ndarray]:
+    """`differences` on a map of `reach` longest sides of the box."""
+    side = reach * float((box[1] - box[0]).max())
     middle = box.mean(0)[:2]
     from_map = np.array(
         [
@@ -48,26 +56,34 @@ def differences(cameras: Cameras, images: Sequence[np.ndarray], box: np.ndarray)
             [0, 0, 1.0],
         ]
     )
-    maps = [_onto_view(cameras[i], float(box[0, 2])) @ from_map for i in range(len(images))]
-    chosen = np.unique(np.linspace(0, len(images) - 1, min(_MOST_VIEWS, len(images))).round().astype(int))
+    maps = [_onto_view(cameras[i], float(box[0, 2])) @ from_map for i in range(len(lab))]
+    chosen = np.unique(np.linspace(0, len(lab) - 1, min(_MOST_VIEWS, len(lab))).round().astype(int))
     seen = np.stack([_lay(lab[i], maps[i]) for i in chosen])
     with np.errstate(all="ignore"):
         plane = _median(seen)
         for _ in range(2):
             # Exposure and white balance differ from view to view.
-            shift = np.nanmedian((plane - seen).reshape(len(seen), -1, 3), axis=1)
+            shift = _median((plane - seen).reshape(len(seen), -1, 3), 1)
             plane = _median(seen + shift[:, None, None])
+        spread = _median(np.abs(seen + shift[:, None, None] - plane).max(-1))
     plane[np.isfinite(seen[..., 0]).sum(0) < LEAST_VIEWS - 1] = np.nan
-    return [_compare(lab[i], plane, maps[i]) for i in range(len(images))]
+    plane[_is_hidden(spread)] = np.nan
+    return [_compare(image, plane, onto) for image, onto in zip(lab, maps, strict=True)]
 
 
-def _median(seen: np.ndarray) -> np.ndarray:
-    """Of what is not NaN, over the first axis."""
-    import warnings
+def _is_hidden(spread: np.ndarray) -> np.ndarray:
+    """Where the object hides the plane from most views, as under its foot: these see different things there.
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a place that no view shows
-        return np.nanmedian(seen, axis=0)
+    Edges on the plane differ, too, by blur; they are thin.
+    """
+    import cv2
+
+    return cv2.erode(np.nan_to_num(spread).astype(np.float32), np.ones((7, 7), np.uint8)) > _UNSURE
+
+
+def _median(seen: np.ndarray, axis: int = 0) -> np.ndarray:
+    """Of what is not NaN, over one axis; NaN where all is. Of an even number the lower of the two."""
+    return torch.from_numpy(seen).nanmedian(axis).values.numpy()
 
 
 def _onto_view(camera: Cameras, height: float) -> np.ndarray:
