@@ -85,6 +85,8 @@ class Capture:
     """How the data was understood, one line each."""
     name: str | None = None
     """Of the scene; by default the root's."""
+    honours: tuple[str, ...] = ()
+    """Of `Request.OF_SOME`, the fields that make a difference to this capture."""
 
 
 def sort_frames(frames: Sequence[Frame]) -> tuple[Frame, ...]:

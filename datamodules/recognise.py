@@ -89,24 +89,23 @@ def load(
         seed: of the built-in scene's noise; real data does not depend on it.
         test: False leaves the test views out, for callers that do not evaluate.
         data_format: the layout, one of `FORMATS`; None recognises it.
-        reading: further fields of `request.Request`; the built-in scene does not use them.
+        reading: further fields of `request.Request`.
 
     Returns:
         Scene with train and test views, cameras float64 on the CPU.
 
     Raises:
         SceneError: for every fault of the data, a missing folder, and an unknown or ambiguous layout.
-        ConfigError: for an option out of range.
+        ConfigError: for an option out of range, or one that the scene cannot honour.
     """
     request = Request(views=views, downscale=downscale, test=test, **reading)
     _check_format(data_format)
     if path is None:
-        if request.split is not None:
+        if data_format is not None:
             raise ConfigError(
-                "the built-in scene has no published split",
-                where="--split",
-                todo="name a scene, or leave it out",
+                "the built-in scene has no files", where="--data-format", todo="name a scene with --data"
             )
+        request.refuse_for_built_in()
         from datamodules.synthetic.config import SyntheticConfig
         from datamodules.synthetic.scene import make_scene
 
@@ -187,7 +186,9 @@ def read_capture(root: Path, data_format: str | None, request: Request) -> Captu
     read: Callable[[Path, Request], Capture] = getattr(
         import_module(f"datamodules.layouts.{form.module}"), form.reader
     )
-    return read(root, request)
+    capture = read(root, request)
+    request.refuse_unused(capture.layout, capture.honours)
+    return capture
 
 
 def _check_format(data_format: str | None) -> None:
@@ -222,6 +223,8 @@ def _only_reading(root: Path) -> str:
 def _guess(root: Path) -> str:
     from datamodules.files.images import ENDINGS  # with NumPy and Pillow, which --help need not wait for
 
+    if root.name in ("images", "masks", "sparse", "0", "rgbs", "matting"):
+        return "one level too deep: the scene is the folder above"
     for folder in _folders_below(root, 3):
         if recognise(folder):
             if any(p.suffix.lower() in ENDINGS for p in folder.rglob("*")):
@@ -230,8 +233,6 @@ def _guess(root: Path) -> str:
             return (
                 f"poses lie in {folder.relative_to(root).as_posix()}, without photographs: put both together"
             )
-    if root.name in ("images", "masks", "sparse", "0", "rgbs", "matting"):
-        return "one level too deep: the scene is the folder above"
     for name, meaning in _ELSEWHERE.items():
         if (root / name).exists():
             return f"{name} is {meaning}"

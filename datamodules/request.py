@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Collection
+from dataclasses import dataclass, fields
+from typing import Literal, NoReturn
 
 from visdom_plugin.errors import ConfigError
+
+OF_SOME = {
+    "frame": "has no frames in time: it is no video",
+    "colmap_model": "is not read from a COLMAP model",
+    "mask_path": "has no mask_path in a transforms.json",
+}
+"""Fields of a request that only some captures can honour, and why the others cannot."""
+_OF_ALL = ("views", "downscale", "test", "hold_out", "allow_missing_masks")
 
 
 @dataclass(frozen=True)
@@ -47,6 +56,27 @@ class Request:
     """Whether views without a mask are read all the same, with `mask_origins` "missing"."""
     allow_outside: bool = False
     """Whether files outside the scene's folder may be read because the data names them."""
+
+    def refuse_unused(self, layout: str, honoured: Collection[str]) -> None:
+        """Raises ConfigError for a field that is given and that a capture cannot honour.
+
+        Args:
+            honoured: of `OF_SOME`, the fields that make a difference.
+        """
+        for name, reason in OF_SOME.items():
+            if name not in honoured and getattr(self, name) != getattr(Request, name):
+                self._refuse(name, f"the scene (read as {layout}) {reason}")
+
+    def refuse_for_built_in(self) -> None:
+        """Raises ConfigError for a field that is given and that the built-in scene cannot honour."""
+        for field in fields(self):
+            if field.name not in _OF_ALL and getattr(self, field.name) != field.default:
+                what = "the built-in scene is drawn, not read from files: this option changes nothing"
+                self._refuse(field.name, what, "name a scene with --data, or leave it out")
+
+    def _refuse(self, name: str, what: str, todo: str = "leave it out") -> NoReturn:
+        group = "data." if name == "mask_source" else ""
+        raise ConfigError(what, where=f"--{group}{name.replace('_', '-')}", todo=todo)
 
     def check(self) -> None:
         """Raises ConfigError for a field out of range."""

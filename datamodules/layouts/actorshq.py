@@ -94,6 +94,7 @@ def read(root: Path, request: Request) -> Capture:
         shrunk=scale,
         units="metres",
         source=source,
+        honours=("frame",),
         notes=tuple(notes),
     )
 

@@ -110,5 +110,6 @@ def read_capture(
         photographs="images",
         mask_folder=mask_folder,
         points_file=points,
+        honours=("colmap_model",),
         notes=(*notes, *said),
     )

@@ -290,6 +290,7 @@ def make_capture(
         tuple(file.path.name for file in files),
         photographs="images" if all(f.image.startswith("images/") for f in ordered) else None,
         mask_folder=None if pointed else "masks",
+        honours=("mask_path",) if pointed else (),
         notes=tuple(notes),
     )
 

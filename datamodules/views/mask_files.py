@@ -18,7 +18,7 @@ from datamodules.files.images import ENDINGS
 from datamodules.files.paths import inside, printable, stem
 from datamodules.request import Request
 from datamodules.views.find_files import loose_key
-from visdom_plugin.errors import SceneError, list_some
+from visdom_plugin.errors import ConfigError, SceneError, list_some
 
 log = logging.getLogger(__name__)
 
@@ -43,10 +43,22 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> M
 
     Raises:
         SceneError: wanted frames without a mask, or masks that look shifted against the photographs.
+        ConfigError: a folder of masks is named, and none is needed.
     """
     named = {i: capture.frames[i].mask for i in wanted}
     open_ones = [i for i in wanted if named[i] is None]
     if not open_ones or request.mask_source == "alpha":
+        if request.masks is not None and not all(
+            str(name).startswith(f"{request.masks}/") for name in named.values()
+        ):
+            alpha = request.mask_source == "alpha"
+            raise ConfigError(
+                "masks are read from alpha channels"
+                if alpha
+                else "the data itself names each photograph's mask",
+                where=f"--masks {request.masks}",
+                todo="leave out --masks" + (", or --data.mask-source alpha" if alpha else ""),
+            )
         return MaskFiles(named)
     photographs = _photographs(capture)
     folder, notes = _find_folder(capture, photographs, open_ones, request)

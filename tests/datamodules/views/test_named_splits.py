@@ -97,5 +97,5 @@ def test_objects_whose_size_stands_in_the_releases_name_are_found_without_it(sce
 
 
 def test_the_built_in_scene_has_no_published_split():
-    with pytest.raises(ConfigError, match="built-in scene has no published split"):
+    with pytest.raises(ConfigError, match="built-in scene is drawn, not read from files"):
         datamodules.load(None, views=4, split="visdom")
