@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import torch
 
@@ -24,7 +25,8 @@ SHEET = "renders/training_now.png"
 SHARE = 0.015
 """Of the seconds trained, what drawing may take."""
 VIEWS, WIDEST_PX, NARROWEST_PX = 3, 200, 64
-"""Training views on the sheet, at most; their width, of which the narrowest is worth looking at."""
+"""Training views on the sheet, at most; widths of their pictures. The first sheet may be small, later ones are at
+least twice as wide: they come the less often and are worth looking at."""
 
 
 class LivePictures:
@@ -75,16 +77,17 @@ class LivePictures:
             int(self.views.cameras.height[i]) / int(self.views.cameras.width[i]) for i in self._chosen
         )
         width = min(WIDEST_PX, int((left / self._per_pixel / heights) ** 0.5))
-        if width < NARROWEST_PX:
+        if width < NARROWEST_PX * (2 if self.count else 1):
             return False
         drawn = [self._draw(i, width) for i in self._chosen]
         pixels = sum(picture.shape[0] * picture.shape[1] for picture in drawn)
         rendered = time.monotonic() - began
         self._per_pixel = rendered / pixels
-        columns = [
-            (self.views.names[i], [draw_truth(self.views, i, self.views.mask_origin(i) == "given"), picture])
-            for i, picture in zip(self._chosen, drawn, strict=True)
-        ]
+        columns = []
+        for i, picture in zip(self._chosen, drawn, strict=True):
+            truth = draw_truth(self.views, i, self.views.mask_origin(i) == "given")
+            smooth = cv2.resize(picture, truth.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+            columns.append((self.views.names[i], [truth, smooth]))
         sheet = draw_sheet(columns, ("photograph", f"step {step}"))
         write_png(self.path, sheet)
         self.keep(sheet, step)
