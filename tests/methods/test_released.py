@@ -1,5 +1,6 @@
 """The authors' recipe as presets: what they set, and the settings of ours that exist for them."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,6 +91,9 @@ def test_fields_have_what_the_release_sets():
     assert (full.hash_decay, full.distortion_weight, full.interlevel_weight) == (10.0, 0.005, 0.01)
     assert (full.mask_weight, full.proposal_mask_share, full.mask_clamp) == (0.1, 0.1, 0.001)
     assert (full.background, full.view_degree) == ("white", 4)
+    # Nothing would pull on a field that starts emptier than the clamp.
+    quick = registry.find("zipnerf+vd:released").quick
+    assert quick.density_bias == full.density_bias > math.log(quick.mask_clamp)
     assert zipnerf_lite.SPEC.presets()["zipnerf-lite+vd"].full.background == "random"
 
 

@@ -182,7 +182,8 @@ class ZipNerfConfig(FieldConfig):
     proposal_mask_share: float = 0.0
     """What the silhouette loss of each proposal weighs, as a share of the field's; 0.1 in the release."""
     mask_clamp: float = 1e-6
-    """The silhouette loss takes opacity, and mask, to be at least this far from 0 and 1; 0.001 in the release."""
+    """The silhouette loss takes opacity, and mask, to be at least this far from 0 and 1; 0.001 in the release.
+    Nearer there is no gradient: a field that starts emptier may stay empty."""
 
     lr: float = 0.00125
     lr_final: float = 0.000125
