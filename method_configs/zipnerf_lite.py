@@ -49,8 +49,8 @@ RELEASED_QUICK: dict[str, object] = {
     "few_views_share": 1.0,
     "samples": (12, 12, 32),
     "test_samples": (24, 24, 32),
-    # As dense at the start as the full size: below `mask_clamp` opacity has no gradient, and a field as empty as that
-    # of the other quick variants may never leave it.
+    # As dense at the start as the full size: below `mask_clamp` opacity has no gradient, and a field as empty as
+    # that of the other quick variants may never leave it.
     "density_bias": -1.0,
     "lr_warm_up": 100,
 }
