@@ -54,7 +54,7 @@ def write_dataset(folder: Path, scene: Scene, hull: Hull | None, motion: Tensor 
             frames.append(part)
     points = _points(hull, scene.train, motion) if hull is not None else None
     write_transforms(folder, cameras, names, frames, points is not None)
-    _write_colmap(folder / "sparse" / "0", cameras, names, points)
+    write_colmap(folder / "sparse" / "0", cameras, names, points)
     made = [folder / name for name in ("images", "masks", "transforms.json", "sparse/0")]
     if hull is not None and points is not None:
         mesh = move(Mesh(*hull.to_mesh()), motion.numpy())
@@ -122,9 +122,19 @@ def write_transforms(
     write_json(folder / "transforms.json", content)
 
 
-def _write_colmap(
-    folder: Path, cameras: list[Cameras], names: list[str], points: tuple[np.ndarray, np.ndarray] | None
+def write_colmap(
+    folder: Path,
+    cameras: list[Cameras],
+    names: list[str],
+    points: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
+    """Writes a binary COLMAP model of pinhole cameras, one per picture.
+
+    Args:
+        cameras: float64, one per picture.
+        names: of the pictures, below the folder of pictures.
+        points: (P, 3) positions and (P, 3) uint8 colours; None writes an empty file of them.
+    """
     lenses, images = [struct.pack("<Q", len(cameras))], [struct.pack("<Q", len(cameras))]
     for i, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
         K, world = camera.intrinsics, camera.camera_from_world
