@@ -67,7 +67,7 @@ _ELSEWHERE = {
 """Files by which neighbouring programs' captures are known, and what to do with them."""
 
 
-_MOST_FOLDERS = 200
+_MOST_FOLDERS, _PEEKED = 200, 1 << 16
 
 
 def load(
@@ -236,6 +236,10 @@ def _guess(root: Path) -> str:
     for name, meaning in _ELSEWHERE.items():
         if (root / name).exists():
             return f"{name} is {meaning}"
+    for path in sorted(root.glob("*.json")):
+        with path.open("rb") as file:
+            if b'"frames"' in file.read(_PEEKED):
+                return f"{path.name} lists frames as a transforms.json does: rename it to transforms.json"
     return (
         "it holds none of the files that the layouts are known by" if any(root.iterdir()) else "it is empty"
     )

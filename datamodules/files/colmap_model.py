@@ -241,9 +241,9 @@ def _add(table: dict[int, _T], key: int, value: _T, path: Path) -> None:
 
 
 def text_lines(data: bytes, path: Path) -> list[str]:
-    """The lines of a text file in UTF-8."""
+    """The lines of a text file in UTF-8, with or without a byte order mark."""
     try:
-        return data.decode("utf-8").splitlines()
+        return data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         damaged(path, f"{path.name} is not text in UTF-8", cause="a binary or damaged file named .txt")
 

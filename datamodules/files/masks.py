@@ -20,6 +20,7 @@ MOST_ENLARGED = 10
 MOST_LABELS, LARGEST_LABEL = 32, 63
 """An image of more, or larger, grey values is no label image but a soft mask."""
 _VOID = 255
+_VOC_VOID = 192 << 16 | 224 << 8 | 224  # blue, green, red of Pascal VOC's outlines
 _SOLID = 0.25
 _NEARLY_FULL = 0.93
 _COLOURFUL = 16  # of 255, between a colour's channels: less comes of reducing a grey picture to a palette
@@ -107,8 +108,10 @@ def _find_labels(data: bytes, path: Path, pixels: np.ndarray) -> tuple[np.ndarra
                 )
             labels = used[(used > 0) & (used <= LARGEST_LABEL)]
             return indices, _VOID if used[-1] == _VOID and 0 < len(labels) >= len(used) - 2 else None
-    if pixels.ndim == 3 and (pixels.shape[2] < 3 or (pixels[..., :1] != pixels[..., :3]).any()):
+    if pixels.ndim == 3 and pixels.shape[2] < 3:
         return None
+    if pixels.ndim == 3 and (pixels[..., :1] != pixels[..., :3]).any():
+        return _find_coloured_labels(pixels) if images.is_lossless(data, path) else None
     grey = pixels if pixels.ndim == 2 else pixels[..., 0]
     if grey.min() > 0 or not images.is_lossless(data, path):
         return None
@@ -134,6 +137,22 @@ def _find_labels(data: bytes, path: Path, pixels: np.ndarray) -> tuple[np.ndarra
             "folder ignore, white where nothing is known",
         )
     return grey, int(values[-1])
+
+
+def _find_coloured_labels(pixels: np.ndarray) -> tuple[np.ndarray, int | None] | None:
+    """The same for (H, W, C) BGR pixels in a few colours that fill areas, black being background."""
+    if pixels.dtype != np.uint8 or np.ptp(pixels[..., :3], axis=2).max() <= _COLOURFUL:
+        return None
+    codes = pixels[..., :3].astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
+    used, labels = np.unique(codes, return_inverse=True)
+    labels = labels.reshape(codes.shape)
+    if used[0] != 0 or len(used) > MOST_LABELS:
+        return None
+    labels = labels.astype(np.uint8)
+    if _solid_share(labels, labels > 0) < _SOLID:
+        return None
+    void = np.flatnonzero(used == _VOC_VOID)
+    return labels, int(void[0]) if len(void) and len(used) > 2 else None
 
 
 def _solid_share(grey: np.ndarray, part: np.ndarray) -> float:

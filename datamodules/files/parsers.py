@@ -48,7 +48,10 @@ def parse_json(data: bytes, path: Path) -> dict[str, Any]:
     except ValueError as error:
         damaged(path, f"{path.name} is not JSON: {str(error)[:200]}")
     if not isinstance(content, dict):
-        damaged(path, f"{path.name} holds {type(content).__name__} at the top, not an object")
+        what = f"{path.name} holds a {type(content).__name__} at the top, not an object"
+        damaged(
+            path, what, "another program's form of the file", "write {...} at the top, with the format's keys"
+        )
     return content
 
 

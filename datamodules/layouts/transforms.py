@@ -266,7 +266,8 @@ def make_capture(
     if any(frame.ignore for frame in ordered):
         notes.append("mask_path means pixels to ignore, as in nerfstudio, not the object's outline")
     # mask_path may point into the folder masks: these files are then no foreground masks.
-    pointed = any(entry.mask_path for file in files for entry in file.entries)
+    pointed = {PurePosixPath(e.mask_path).parts[0] for file in files for e in file.entries if e.mask_path}
+    masks = "masks" if not pointed or ("masks" not in pointed and (root / "masks").is_dir()) else None
 
     def calibrate(wanted: Sequence[int]) -> Calibration:
         lenses = [_lens(there, ordered[i], *of_name[ordered[i].name][:2], request) for i in wanted]
@@ -289,7 +290,7 @@ def make_capture(
         pools,
         tuple(file.path.name for file in files),
         photographs="images" if all(f.image.startswith("images/") for f in ordered) else None,
-        mask_folder=None if pointed else "masks",
+        mask_folder=masks,
         honours=("mask_path",) if pointed else (),
         notes=tuple(notes),
     )

@@ -140,7 +140,8 @@ def _find_folder(
         )
     others = []
     for path in sorted(capture.root.iterdir()):
-        if path.name.lower() in OTHER_FOLDERS and path.name != folder and path.is_dir():
+        named = path.name.lower() in (*OTHER_FOLDERS, folder.lower())
+        if named and path.name != folder and path.is_dir():
             matched, _ = _match(photographs, _image_files(path))
             if all(len(matched.get(i, ())) == 1 for i in wanted):
                 others.append(path.name)

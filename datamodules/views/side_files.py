@@ -152,15 +152,20 @@ def _beside(path: Path) -> Path | None:
 
 
 def _other_folders(root: Path, file: Frame) -> list[str]:
-    """Folders beside the photographs' that hold a picture of a photograph's name and could hold masks."""
-    name = loose_key(PurePosixPath(file.image).name)
+    """Folders, below the root or beside the photograph, that hold a picture of its name and could hold masks."""
+    image = PurePosixPath(file.image)
     known = ("images", "depth", "normal", "ignore", "sparse")
-    folders = [p for p in sorted(root.iterdir()) if p.is_dir() and not p.name.lower().startswith(known)]
+    places = dict.fromkeys(p for folder in (root, (root / image).parent) for p in sorted(folder.iterdir()))
+    folders = [p for p in places if p.is_dir() and not p.name.lower().startswith(known)]
     return [
-        folder.name
+        folder.relative_to(root).as_posix()
         for folder in folders
-        if folder.name != PurePosixPath(file.image).parts[0]
-        and any(loose_key(p.name) == name for p in folder.iterdir() if p.suffix.lower() in images.ENDINGS)
+        if folder.name != image.parts[0]
+        and any(
+            loose_key(p.name) == loose_key(image.name)
+            for p in folder.iterdir()
+            if p.suffix.lower() in images.ENDINGS
+        )
     ]
 
 

@@ -191,6 +191,19 @@ def test_void_in_label_images_is_unknown(make):
     assert np.array_equal(mask.opacity > 0.5, (OUTLINED > 0) & (OUTLINED < 255))
 
 
+def test_colours_of_label_images_are_object_where_they_are_not_black():
+    colours = np.uint8([[0, 0, 0], [0, 0, 64], [90, 0, 0], [192, 224, 224]])
+    index = np.select([OUTLINED == 255, OUTLINED == 2, OUTLINED == 15], [3, 1, 2], 0)
+    mask = masks.decode_mask(_cv(colours[index]), "mask.png")
+    assert np.array_equal(mask.unknown, index == 3) and np.array_equal(
+        mask.opacity > 0.5, (index > 0) & (index < 3)
+    )
+    mask = masks.decode_mask(_cv(colours[np.where(index == 3, 1, index)]), "mask.png")
+    assert mask.labelled and mask.unknown is None and np.array_equal(mask.opacity > 0.5, index > 0)
+    photograph = np.random.default_rng(0).integers(0, 200, (*index.shape, 3)).astype(np.uint8)
+    assert not masks.decode_mask(_cv(photograph * (index > 0)[..., None]), "mask.png").labelled
+
+
 def test_void_that_could_be_the_object_is_refused():
     wide = OUTLINED.copy()
     wide[:, 38:] = 255

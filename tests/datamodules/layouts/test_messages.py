@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 
 import cv2
 import numpy as np
@@ -136,6 +137,56 @@ def test_masks_among_the_photographs_are_named(pattern, views, tmp_path):
     with pytest.raises(SceneError, match="masks among the photographs") as caught:
         load(folder)
     assert "move such files to masks/" in caught.value.todo
+
+
+@pytest.mark.parametrize("place", ["Masks", "images/masks"])
+def test_folders_of_masks_beside_the_usual_one(place, views, tmp_path):
+    folder = w.write_colmap(views, tmp_path / "s")
+    expected = load(folder, views=4).train.masks
+    (folder / "masks").rename(folder / "aside")
+    (folder / "aside").rename(folder / place)
+    if place == "images/masks":
+        with pytest.raises(SceneError, match="--masks images/masks"):
+            load(folder, views=4)
+    found = load(folder, views=4, masks=place if "/" in place else None).train.masks
+    assert all(map(torch.equal, found, expected))
+
+
+def test_masks_and_files_of_valid_pixels_are_both_read(views, tmp_path):
+    """nerfstudio's mask_path beside a folder of foreground masks."""
+    folder = w.write_nerfstudio(views, tmp_path / "s")
+    (folder / "mask").mkdir()
+    valid = np.full((30, 40), 255, np.uint8)
+    valid[:5] = 0
+
+    def change(frame):
+        frame["mask_path"] = frame["file_path"].replace("images/", "mask/")
+        cv2.imwrite(str(folder / frame["mask_path"]), valid)
+
+    expected = load(folder, views=4).train
+    _edit(folder, change)
+    found = load(folder, views=4).train
+    assert all(map(torch.equal, found.masks, expected.masks))
+    assert found.ignored(0)[:5].all() and not found.ignored(0)[5:].any()
+    shutil.rmtree(folder / "masks")
+    with pytest.raises(SceneError, match="says which pixels to ignore"):
+        load(folder, views=4)
+
+
+def test_byte_order_marks_and_lists_at_the_top(views, tmp_path):
+    folder = w.write_colmap(views, tmp_path / "s", binary=False)
+    expected = load(folder, views=4).train.cameras
+    for name in ("cameras.txt", "images.txt"):
+        path = folder / "sparse/0" / name
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert same_cameras(load(folder, views=4).train.cameras, expected)
+    other = w.write_nerfstudio(views, tmp_path / "t")
+    (other / "transforms.json").rename(other / "cameras_all.json")
+    with pytest.raises(SceneError, match=r"cameras_all\.json lists frames .* rename it to transforms\.json"):
+        load(other)
+    (other / "transforms.json").write_text("[]")
+    with pytest.raises(SceneError, match="another program's form"):
+        load(other)
 
 
 def test_a_model_far_below_and_a_scene_far_below(views, tmp_path):
