@@ -21,7 +21,7 @@ import numpy as np
 
 from datamodules import load
 from visdom_plugin.prepare.demo import DemoConfig, Truth, true_mask, write_demo
-from visdom_plugin.prepare.run import COLMAP, Plan, Prepared, prepare
+from visdom_plugin.prepare.run import Plan, Prepared, prepare
 from visdom_plugin.prepare.settings import MaskSettings
 
 KINDS = {
@@ -76,9 +76,8 @@ def main() -> None:
     parser.add_argument("what", nargs="?", choices=("poses", "masks", "time"), default="poses")
     parser.add_argument("--views", type=int, default=12)
     parser.add_argument("--size", type=int, nargs=2, default=(1600, 1200))
-    parser.add_argument("--colmap", action="store_true", help="poses by COLMAP, too (needs pycolmap)")
     args = parser.parse_args()
-    config = DemoConfig(views=args.views, size=tuple(args.size), samples=1)
+    config = DemoConfig(views=args.views, size=tuple(args.size), samples=1 if args.what == "time" else 2)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         {"poses": measure_poses, "masks": measure_masks, "time": measure_time}[args.what](
@@ -123,8 +122,6 @@ def measure_masks(folder: Path, config: DemoConfig, args: argparse.Namespace) ->
             made(taken, folder / f"{taken.name}{i}", masks)
             found = ious(folder / f"{taken.name}{i}", truths)
             print(f"| {kind} | {way} | {found.mean():.3f} | {found.min():.3f} |", flush=True)
-        if args.colmap:
-            made(taken, folder / "colmap", MaskSettings("none"), poses=COLMAP)
 
 
 def measure_time(folder: Path, config: DemoConfig, args: argparse.Namespace) -> None:

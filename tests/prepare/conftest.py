@@ -21,7 +21,7 @@ class Photographs(NamedTuple):
 def photographs(tmp_path_factory) -> Photographs:
     """Six photographs of 960 x 720, two of them upright, with distortion, blur and noise. Not to be written to."""
     folder = tmp_path_factory.mktemp("taken") / "photographs"
-    config = DemoConfig(views=6, size=(960, 720), samples=1)
+    config = DemoConfig(views=6, size=(960, 720), samples=1, radial=(-0.2, 0.06))
     return Photographs(folder, write_demo(folder, config), config)
 
 

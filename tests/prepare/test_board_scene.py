@@ -5,12 +5,17 @@ from __future__ import annotations
 import hashlib
 import json
 
+import cv2
 import numpy as np
 import pytest
+import torch
 
 from datamodules import load
 from visdom_plugin.cli.commands.prepare import main
+from visdom_plugin.geometry.cameras import project
+from visdom_plugin.prepare.board import corner_points, find_corners
 from visdom_plugin.prepare.demo import true_mask
+from visdom_plugin.prepare.settings import BoardSettings
 
 
 def hashes(folder) -> dict[str, str]:
@@ -32,9 +37,22 @@ def test_poses_are_the_true_ones_in_metres(photographs, prepared):
         turn = found[:3, :3].T @ truth.world_from_camera[:3, :3]
         angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
         away = np.linalg.norm(found[:3, 3] - truth.world_from_camera[:3, 3])
-        assert angle < 0.3 and away < 0.01 * np.linalg.norm(truth.world_from_camera[:3, 3]), truth.name
+        assert angle < 1.0 and away < 0.02 * np.linalg.norm(truth.world_from_camera[:3, 3]), truth.name
         assert views.cameras.intrinsics[i, 0, 0] == pytest.approx(truth.focal_px, rel=0.01)
         assert (views.images[i].shape[1], views.images[i].shape[0]) == truth.size
+
+
+def test_the_board_lies_where_the_cameras_of_the_scene_see_it(photographs, prepared):
+    """Pictures, distortion, orientation and cameras fit: corners found again in the written pictures."""
+    views = views_of(prepared)
+    points = torch.from_numpy(corner_points(BoardSettings()))
+    for i, image in enumerate(views.images):
+        found = find_corners(cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY), BoardSettings())
+        away = project(views.cameras[i], points[found.ids])[0].numpy() - found.uv
+        assert len(found.ids) >= 6 and np.median(np.linalg.norm(away, axis=-1)) < 1.0
+    # Half way to the pictures' corners the lens bends by far more than that.
+    k1, k2 = photographs.config.radial
+    assert abs(k1 * 0.4**3 + k2 * 0.4**5) * photographs.truths[0].focal_px > 5
 
 
 def test_masks_are_near_the_true_ones(photographs, prepared):
@@ -44,7 +62,7 @@ def test_masks_are_near_the_true_ones(photographs, prepared):
         mask = views.masks[i].numpy()
         true = true_mask(truth, (mask.shape[1], mask.shape[0]))
         ious.append((mask & true).sum() / (mask | true).sum())
-    assert min(ious) > 0.7 and np.mean(ious) > 0.8, ious
+    assert min(ious) > 0.75 and np.mean(ious) > 0.85, ious
 
 
 def test_the_record_says_what_was_done(photographs, prepared):

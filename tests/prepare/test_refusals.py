@@ -52,7 +52,7 @@ def test_another_dictionary_is_named(photographs, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("reach", "what"),
     [
-        (45, "no board (7 x 10 squares, markers 4X4_50) was found in any of 2 photographs"),
+        (34, "no board (7 x 10 squares, markers 4X4_50) was found in any of 2 photographs"),
         (75, "the board can be used in 0 of 2 photographs"),
     ],
 )

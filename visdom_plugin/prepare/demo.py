@@ -89,10 +89,10 @@ def write_demo(folder: Path, config: DemoConfig, board: BoardSettings | None = N
     return truths
 
 
-def true_mask(truth: Truth, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool: the object as a pinhole camera of that size sees it in the view."""
+def true_mask(truth: Truth, size: tuple[int, int], radial: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """(H, W) bool: the object as a camera of that size sees it in the view; a pinhole unless `radial` bends it."""
     scale = size[0] / truth.size[0]
-    uv, depth = _project(truth, np.zeros(4))
+    uv, depth = _project(truth, np.array(radial))
     found = rasterise(uv * scale, depth, watering_can().faces, *size)
     mask = np.zeros(size[0] * size[1], bool)
     mask[found.sample] = True

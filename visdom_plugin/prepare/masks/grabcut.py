@@ -14,6 +14,8 @@ BACKGROUND, OBJECT, LIKELY_BACKGROUND, LIKELY_OBJECT = range(4)
 WORKING_PX = 480
 """Longest side of the copy."""
 _RADIUS, _EPSILON = 6, 1e-3
+_BINS, _RARE = 32, 2e-4
+"""Bins of a colour along each axis, and the share of the background below which it hardly has one."""
 _LEAST = 20
 """Pixels of a colour model, at least."""
 
@@ -41,6 +43,23 @@ def cut(image: np.ndarray, labels: np.ndarray, rounds: int = 4) -> np.ndarray:
     whole: Any = None
     cv2.grabCut(bgr, labels, whole, *models, rounds, cv2.GC_INIT_WITH_MASK)
     return np.isin(labels, (OBJECT, LIKELY_OBJECT))
+
+
+def rarity(image: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """(h, w) bool: pixels of colours that the background hardly has.
+
+    Args:
+        image: (h, w, 3) uint8 RGB.
+        background: (h, w) bool, what is surely background.
+    """
+    import cv2
+    from scipy.ndimage import gaussian_filter
+
+    bins = (cv2.cvtColor(image, cv2.COLOR_RGB2LAB) // (256 // _BINS)).astype(np.int64)
+    index = (bins[..., 0] * _BINS + bins[..., 1]) * _BINS + bins[..., 2]
+    counts = np.bincount(index[background], minlength=_BINS**3).astype(np.float64)
+    share = gaussian_filter(counts.reshape(_BINS, _BINS, _BINS), 0.7).ravel() / max(1.0, counts.sum())
+    return share[index] < _RARE
 
 
 def shrink(image: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from visdom_plugin.prepare.masks.grabcut import (
     OBJECT,
     cut,
     enlarge,
+    rarity,
     shrink,
     tidy,
 )
@@ -86,7 +87,9 @@ def cut_views(
                 )
                 break
             outlines = [depth_and_silhouette(hull, copies.cameras[i])[1].numpy() for i in range(len(masks))]
-            corrected = [_correct(*x) for x in zip(starts, masks, outlines, unlike, strict=True)]
+            corrected = [
+                _correct(*x) for x in zip(copies.images, starts, masks, outlines, unlike, strict=True)
+            ]
             masks = _cut_all(copies.images, corrected)
         if not last:
             if hull is None:
@@ -165,7 +168,7 @@ def _carve(cameras: Cameras, masks: Sequence[np.ndarray], box: np.ndarray) -> Hu
 
 
 def _correct(
-    start: np.ndarray, mask: np.ndarray, outline: np.ndarray, unlike: np.ndarray | None
+    image: np.ndarray, start: np.ndarray, mask: np.ndarray, outline: np.ndarray, unlike: np.ndarray | None
 ) -> np.ndarray:
     """Labels for the next cut: nothing far outside the hull is object; what differs from the plane and what the
     others see of the hull likely is."""
@@ -178,6 +181,10 @@ def _correct(
     labels = np.where(mask, LIKELY_OBJECT, LIKELY_BACKGROUND).astype(np.uint8)
     if unlike is None:
         labels[inner] = LIKELY_OBJECT
+    else:
+        # Where the plane says nothing: what the others demand, as far as the background has not its colour.
+        rare = rarity(image, start == BACKGROUND) & ~cv2.dilate(mask.astype(np.uint8), kernel).astype(bool)
+        labels[outline & np.isnan(unlike) & rare] = LIKELY_OBJECT
     labels[start == OBJECT] = OBJECT
     labels[far | (start == BACKGROUND)] = BACKGROUND
     return labels
