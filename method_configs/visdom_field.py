@@ -8,12 +8,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from method_configs import ingp
+from visdom_plugin.hull.inside.config import InsideConfig
 from visdom_plugin.methods.fields.configs import IngpConfig
 from visdom_plugin.registry import MethodSpec
 
 PAPER = ingp.SPEC.presets()["ingp+vd"]
 QUICK, FULL = (
-    replace(config, prior_weight=0.05)
+    replace(config, prior_weight=0.05, inside=InsideConfig(radius=1.0))
     for config in (PAPER.quick, PAPER.full)
     if isinstance(config, IngpConfig)
 )
