@@ -55,7 +55,8 @@ def _write_h264(path: Path, fps: int) -> Iterator[AddFrame]:
 
         def add(frame: np.ndarray) -> None:
             frame = _make_even(frame)
-            stream.height, stream.width = frame.shape[:2]
+            if not stream.codec_context.is_open:
+                stream.height, stream.width = frame.shape[:2]
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
 
         yield add
