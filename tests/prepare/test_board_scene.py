@@ -45,11 +45,13 @@ def test_poses_are_the_true_ones_in_metres(photographs, prepared):
 def test_the_board_lies_where_the_cameras_of_the_scene_see_it(photographs, prepared):
     """Pictures, distortion, orientation and cameras fit: corners found again in the written pictures."""
     views = views_of(prepared)
-    points = torch.from_numpy(corner_points(BoardSettings()))
+    points, total = torch.from_numpy(corner_points(BoardSettings())), 0
     for i, image in enumerate(views.images):
         found = find_corners(cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY), BoardSettings())
         away = project(views.cameras[i], points[found.ids])[0].numpy() - found.uv
-        assert len(found.ids) >= 6 and np.median(np.linalg.norm(away, axis=-1)) < 1.0
+        total += len(found.ids)
+        assert np.median(np.linalg.norm(away, axis=-1)) < 1.0
+    assert total > 60
     # Half way to the pictures' corners the lens bends by far more than that.
     k1, k2 = photographs.config.radial
     assert abs(k1 * 0.4**3 + k2 * 0.4**5) * photographs.truths[0].focal_px > 5
