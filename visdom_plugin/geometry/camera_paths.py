@@ -111,25 +111,25 @@ def orbit(cameras: Cameras, count: int, look_at: Tensor | None = None) -> Camera
 
 
 def widen(cameras: Cameras, points: Tensor, margin: float = 0.05) -> Cameras:
-    """Cameras (N,) with shorter focal lengths where that is needed to have points (P, 3) in their pictures.
+    """Cameras (N,) that look straight ahead, with shorter focal lengths where that is needed to see points (P, 3).
 
-    All are shortened by the same factor.
+    The principal points come to the middle. All focal lengths are shortened by the same factor.
 
     Args:
-        margin: share of the picture's half that stays free beside them.
+        margin: share of the picture's half that stays free beside the points.
     """
-    K = cameras.intrinsics
-    uv, depth = project(cameras, points.to(cameras.world_from_camera))
-    centre = K[:, None, :2, 2]
-    size = torch.stack([cameras.width, cameras.height], -1)[:, None]
-    # How far a point lies on its way from the principal point to the picture's border.
-    share = torch.where(uv > centre, (uv - centre) / (size - centre), (centre - uv) / centre).amax(-1)
+    wider = cameras.intrinsics.clone()
+    size = torch.stack([cameras.width, cameras.height], -1)
+    wider[:, :2, 2] = size.to(wider) / 2
+    middle = Cameras(wider, cameras.world_from_camera, cameras.width, cameras.height)
+    uv, depth = project(middle, points.to(cameras.world_from_camera))
+    # How far a point lies on its way from the middle to the picture's border.
+    share = (uv / size[:, None] * 2 - 1).abs().amax(-1)
     farthest = float(share[depth > 0].amax()) if bool((depth > 0).any()) else 0.0
     factor = min(1.0, (1 - margin) / max(farthest, 1e-9))
-    wider = K.clone()
     wider[:, 0, 0] *= factor
     wider[:, 1, 1] *= factor
-    return Cameras(wider, cameras.world_from_camera, cameras.width, cameras.height)
+    return middle
 
 
 def resample(cameras: Cameras, count: int, look_at: Tensor) -> Cameras:
