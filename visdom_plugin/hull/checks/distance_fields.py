@@ -64,16 +64,18 @@ class Outlines:
         return replace(self, fields=tuple(fitted))
 
 
-def draw_outlines(cameras: Cameras, silhouettes: Silhouettes) -> Outlines:
-    """Distance fields of masks at low resolution, so that a typical object is OBJECT_PX pixels long.
+def draw_outlines(cameras: Cameras, silhouettes: Silhouettes, *, object_px: int = OBJECT_PX) -> Outlines:
+    """Distance fields of masks at low resolution.
 
     Args:
         cameras: (N,) the ones of `silhouettes`.
+        object_px: how long a typical object becomes, in pixels.
     """
     sides = silhouettes.sizes.max(1)
     known = silhouettes.demanding()
     lengths = np.array([object_length(known.mask(view)) for view in range(len(known))]) / sides
-    longest = min(OBJECT_PX / float(np.median(lengths[lengths > 0])), MOST_PX) if lengths.any() else OBJECT_PX
+    most = MOST_PX * object_px / OBJECT_PX
+    longest = min(object_px / float(np.median(lengths[lengths > 0])), most) if lengths.any() else object_px
     fields, ratios = [], []
     for view in range(len(silhouettes)):
         mask = silhouettes.mask(view)

@@ -1,0 +1,1 @@
+"""Poses refined by silhouettes."""

@@ -1,0 +1,201 @@
+"""Poses refined by silhouettes: small turns of the cameras that make the masks agree.
+
+Levenberg-Marquardt over all cameras' turns and the depths of the points on the rays through the outlines, from soft
+hinges to hard ones. Close to the truth only the rays that touch the object's rims seen by two cameras at once bind
+(epipolar tangencies), two for every pair of views: a turn of each camera is determined from four views on, a move of
+each, too, only from about seven on, and then hardly. So cameras keep their places unless they are told to be uncertain.
+One thing stays open whatever the views: all cameras turned so that the object seems to stand a little beside its place.
+The masks hardly tell, and a hull is carved there as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visdom_plugin.errors import ConfigError
+from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.hull.carving.votes import Masks, gather_silhouettes
+from visdom_plugin.hull.checks.distance_fields import Outlines, draw_outlines
+from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
+from visdom_plugin.hull.refine.rays import Rays, assemble, cost_of, find_points, outline_pixels, pack
+
+_OBJECT_PX = 256
+_RAYS = 512
+_SOFTNESS_PX = (2.0, 1.0, 0.5, 0.25)
+"""Of one cycle's rounds: hard hinges are exact and hold fast at the first masks they meet, soft ones let go again."""
+_CYCLES, _STEPS = 15, 8
+_SPREAD_PX = 0.5
+"""Standard deviation of one outline's word."""
+_WORDS = 40
+"""Independent words in the outline of one mask: neighbouring rays repeat each other."""
+_ENOUGH_DEG = 0.005
+"""No turn in a round of a whole cycle is larger: that is the end."""
+_AGREE_PX = 0.01
+"""Mean residual below which masks agree already and nothing is changed."""
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """How uncertain the given poses are; corrections are weighed against it."""
+
+    turn_deg: float = 2.0
+    """Standard deviation of each camera's orientation about each of its axes."""
+    move: float = 0.0
+    """Standard deviation of each camera's place along each axis, as a part of its distance; 0 keeps all places."""
+
+    def check(self) -> None:
+        """Raises ConfigError for a field out of its range."""
+        for name, value, low, high in (
+            ("turn_deg", self.turn_deg, 1e-3, 45.0),
+            ("move", self.move, 0.0, 0.5),
+        ):
+            if not (math.isfinite(value) and low <= value <= high):
+                raise ConfigError(
+                    f"RefineConfig.{name} is {value}", cause="out of range", hint=f"give {low:g} to {high:g}"
+                )
+
+
+class Refined(NamedTuple):
+    """The result of `refine_poses`."""
+
+    cameras: Cameras
+    """The refined ones; the given ones where that did not make the masks agree better."""
+    turned_deg: np.ndarray
+    """(N,) by how many degrees each was turned."""
+    moved: np.ndarray
+    """(N,) by how much each was moved, as a part of its distance to the object."""
+    before: float
+    """Mean residual of the masks' rays, in pixels of masks about 256 pixels long."""
+    after: float
+
+
+def refine_poses(
+    cameras: Cameras,
+    masks: Masks,
+    ignore: Sequence[Tensor | np.ndarray | None] = (),
+    config: RefineConfig | None = None,
+    *,
+    free: Sequence[int] | None = None,
+) -> Refined:
+    """Turns cameras by a little, so that some point of every ray through a mask lies inside the other masks.
+
+    Args:
+        cameras: (N,) with poses that are roughly right: within a few degrees.
+        masks: N tensors or arrays (H, W), True on the object; or one (N, H, W).
+        ignore: N tensors or arrays (H, W) bool or None, True where nothing is known; or empty.
+        free: the views whose cameras may be turned; all by default.
+
+    Raises:
+        ConfigError: a field of the config is out of range.
+        SceneError: cameras and masks do not belong together (as `carve`).
+    """
+    config = config or RefineConfig()
+    config.check()
+    outlines = draw_outlines(cameras, gather_silhouettes(cameras, masks, ignore), object_px=_OBJECT_PX)
+    before = measure_coherence(outlines, power=False).score
+    still = Refined(cameras, *np.zeros((2, len(cameras))), before, before)
+    if len(cameras) < 3 or before <= _AGREE_PX:
+        return still
+    found = _solve(outlines, config, range(len(cameras)) if free is None else free)
+    after = measure_coherence(found, power=False).score if found else before
+    if found is None or not after < before:
+        return still
+    turn = np.einsum("nij,nik->njk", outlines.rotations, found.rotations)
+    cosine = (np.trace(turn, axis1=1, axis2=2) - 1) / 2
+    motion = cameras.world_from_camera.clone()
+    motion[:, :3, :3] = torch.as_tensor(found.rotations).to(motion)
+    motion[:, :3, 3] = torch.as_tensor(found.centres).to(motion)
+    shift = np.linalg.norm(found.centres - outlines.centres, axis=1) / _distances(found)
+    turned = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    refined = Cameras(cameras.intrinsics, motion, cameras.width, cameras.height)
+    return Refined(refined, turned, shift, before, after)
+
+
+def _distances(outlines: Outlines) -> np.ndarray:
+    """(N,) from each camera to where the object seems to be; ones where it is nowhere."""
+    ball = measure_coherence(outlines, 128, power=False).ball
+    return np.ones(len(outlines)) if ball is None else np.linalg.norm(outlines.centres - ball[0], axis=1)
+
+
+def _solve(outlines: Outlines, config: RefineConfig, free: Sequence[int]) -> Outlines | None:
+    """The views with the poses that fit best; None where the masks agree nowhere."""
+    views = len(outlines)
+    spread = np.tile(np.repeat([math.radians(config.turn_deg), config.move], 3), views)
+    held = np.ones(views, bool)
+    held[list(free)] = False
+    index = np.flatnonzero((spread > 0) & ~np.repeat(held, 6))
+    distance = _distances(outlines)
+    change, damping = np.zeros(6 * views), 1e-3
+    for _ in range(_CYCLES):
+        largest = 0.0
+        for softness in _SOFTNESS_PX:
+            ball = measure_coherence(outlines, 128, power=False).ball
+            if ball is None:
+                return None
+            view, uv = outline_pixels(outlines, _RAYS)
+            rays, _ = find_points(pack(outlines), view, uv, ball)
+            if not len(rays.view):
+                return None
+            weight = _WORDS * views / len(view) / _SPREAD_PX**2
+            before = change
+            for _ in range(_STEPS):
+                tried = _step(outlines, rays, distance, softness, weight, change, spread, index, damping)
+                if tried is None:
+                    damping = 1e-3
+                    break
+                outlines, rays, step, damping = tried
+                change = change + step
+            largest = max(largest, float(np.abs(change - before).reshape(views, 6)[:, :3].max()))
+        if largest < math.radians(_ENOUGH_DEG):
+            break
+    return outlines
+
+
+def _step(
+    outlines: Outlines, rays: Rays, distance: np.ndarray, softness: float, weight: float, change: np.ndarray,
+    spread: np.ndarray, index: np.ndarray, damping: float,
+) -> tuple[Outlines, Rays, np.ndarray, float] | None:  # fmt: skip
+    """One step that lowers the cost, with the damping to go on with; None where none does."""
+    packed = pack(outlines)
+    precision = 1 / spread[index] ** 2
+    views = len(outlines)
+    while damping < 1e6:
+        system = assemble(packed, rays, distance, softness, damping)
+        matrix = weight * system.matrix[np.ix_(index, index)] + np.diag(precision)
+        vector = weight * system.vector[index] + change[index] * precision
+        step = np.zeros(6 * views)
+        step[index] = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), vector)
+        turns, moves = step.reshape(views, 2, 3).transpose(1, 0, 2)
+        tried = replace(
+            outlines,
+            rotations=outlines.rotations @ _rotations(turns),
+            centres=outlines.centres + distance[:, None] * moves,
+        )
+        # A depth is looked for anew in every round; within one it must not leap to another part of the object.
+        most = 0.03 * distance[rays.view]
+        deeper = system.depth_step + (system.depth_per_pose * step).sum(1)
+        moved = rays._replace(depth=rays.depth + np.clip(deeper, -most, most))
+        now = weight * system.cost + 0.5 * (change[index] ** 2 * precision).sum()
+        then = weight * cost_of(pack(tried), moved, distance, softness)
+        if then + 0.5 * ((change + step)[index] ** 2 * precision).sum() < now:
+            return tried, moved, step, max(damping / 5, 1e-6)
+        damping *= 5
+    return None
+
+
+def _rotations(turns: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) rotations by the vectors (N, 3), in radians about their directions (Rodrigues)."""
+    angle = np.linalg.norm(turns, axis=-1)[:, None, None]
+    zero = np.zeros(len(turns))
+    x, y, z = turns.T
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    return (
+        np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (cross @ cross)
+    )
