@@ -1,11 +1,11 @@
 """Poses refined by silhouettes: small turns of the cameras that make the masks agree.
 
-Levenberg-Marquardt over all cameras' turns and the depths of the points on the rays through the outlines, from soft
-hinges to hard ones. Close to the truth only the rays that touch the object's rims seen by two cameras at once bind
-(epipolar tangencies), two for every pair of views: a turn of each camera is determined from four views on, a move of
-each, too, only from about seven on, and then hardly. So cameras keep their places unless they are told to be uncertain.
-One thing stays open whatever the views: all cameras turned so that the object seems to stand a little beside its place.
-The masks hardly tell, and a hull is carved there as well.
+Levenberg-Marquardt over all cameras' turns and the depths of the points on the rays through the outlines, with
+soft hinges. Close to the truth only those rays bind that touch a rim of the object which two cameras see at once
+(epipolar tangencies), two for every pair of views. That determines a turn of each camera from six views on; a
+move of each as well only from many more. So cameras keep their places unless they are said to be uncertain. One
+thing is hardly told by masks whatever the views: all cameras turned so that the object seems to stand a little
+beside its place. A hull is carved there just as well.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from visdom_plugin.hull.refine.rays import Rays, assemble, cost_of, find_points,
 _OBJECT_PX = 256
 _RAYS = 512
 _SOFTNESS_PX = (2.0, 1.0, 0.5, 0.25)
-"""Of one cycle's rounds: hard hinges are exact and hold fast at the first masks they meet, soft ones let go again."""
+"""Of one cycle's rounds: hard hinges are exact but stop at the first masks they meet, soft ones let go again."""
 _CYCLES, _STEPS = 15, 8
 _SPREAD_PX = 0.5
 """Standard deviation of one outline's word."""
@@ -57,9 +57,7 @@ class RefineConfig:
             ("move", self.move, 0.0, 0.5),
         ):
             if not (math.isfinite(value) and low <= value <= high):
-                raise ConfigError(
-                    f"RefineConfig.{name} is {value}", cause="out of range", hint=f"give {low:g} to {high:g}"
-                )
+                raise ConfigError(f"RefineConfig.{name} is {value}", todo=f"give {low:g} to {high:g}")
 
 
 class Refined(NamedTuple):
@@ -108,12 +106,14 @@ def refine_poses(
     if found is None or not after < before:
         return still
     turn = np.einsum("nij,nik->njk", outlines.rotations, found.rotations)
+    # Not by the arc cosine of the trace, which tells no turns below a millionth of a degree from none.
+    sine = np.linalg.norm(turn - turn.transpose(0, 2, 1), axis=(1, 2)) / math.sqrt(8)
     cosine = (np.trace(turn, axis1=1, axis2=2) - 1) / 2
     motion = cameras.world_from_camera.clone()
     motion[:, :3, :3] = torch.as_tensor(found.rotations).to(motion)
     motion[:, :3, 3] = torch.as_tensor(found.centres).to(motion)
     shift = np.linalg.norm(found.centres - outlines.centres, axis=1) / _distances(found)
-    turned = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    turned = np.degrees(np.arctan2(sine, cosine))
     refined = Cameras(cameras.intrinsics, motion, cameras.width, cameras.height)
     return Refined(refined, turned, shift, before, after)
 

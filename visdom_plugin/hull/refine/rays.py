@@ -1,10 +1,10 @@
 """Rays through the masks' outlines: where along each the other masks agree best, and how they would move it.
 
-Everything is in the pixels of `Outlines`. A ray through the outline of one mask touches the object, so some point of
-it lies inside every mask that sees it (silhouette coherence; Hernandez, Schmitt and Cipolla, PAMI 2007). How far
-outside a mask a point lies is read from the mask's distance field and taken as a soft hinge,
-softness * log(1 + exp(distance / softness)), so that points just inside count a little, too: without that a step stops
-at the first mask that it runs into.
+Everything is in the pixels of `Outlines`. A ray through the outline of one mask touches the object, so some point
+of it lies inside every mask that sees it (silhouette coherence; Hernandez, Schmitt and Cipolla, PAMI 2007). How
+far outside a mask a point lies is read from the mask's distance field and taken as a soft hinge,
+softness * log(1 + exp(distance / softness)), so that points just inside count a little, too: otherwise a step
+stops at the first mask that it runs into.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ _CHUNK = 64
 _FREE = -1e3
 """Distance where a view says nothing: behind it, outside its frame, at unknown pixels."""
 _FADE = 0.06
-"""A mask's word fades out over this part of the frame's longer side before its border: what leaves the frame must not
-pull by leaps."""
+"""Over this part of the frame's longer side before its border a mask's pull fades out: what leaves the frame must
+not do so by a leap."""
 _STEPS, _FINE_STEPS = 96, 16
 _REACH = 1.2
 """Depths are tried over the object's ball, this much larger."""
