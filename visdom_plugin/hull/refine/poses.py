@@ -10,6 +10,7 @@ beside its place. A hull is carved there just as well.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,8 @@ from visdom_plugin.hull.carving.votes import Masks, gather_silhouettes
 from visdom_plugin.hull.checks.distance_fields import Outlines, draw_outlines
 from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
 from visdom_plugin.hull.refine.rays import Rays, assemble, cost_of, find_points, outline_pixels, pack
+
+log = logging.getLogger(__name__)
 
 _OBJECT_PX = 256
 _RAYS = 512
@@ -98,7 +101,8 @@ def refine_poses(
     config.check()
     outlines = draw_outlines(cameras, gather_silhouettes(cameras, masks, ignore), object_px=_OBJECT_PX)
     before = measure_coherence(outlines, power=False).score
-    still = Refined(cameras, *np.zeros((2, len(cameras))), before, before)
+    zeros = np.zeros(len(cameras))
+    still = Refined(cameras, zeros, zeros, before, before)
     if len(cameras) < 3 or before <= _AGREE_PX:
         return still
     found = _solve(outlines, config, range(len(cameras)) if free is None else free)
@@ -133,7 +137,7 @@ def _solve(outlines: Outlines, config: RefineConfig, free: Sequence[int]) -> Out
     index = np.flatnonzero((spread > 0) & ~np.repeat(held, 6))
     distance = _distances(outlines)
     change, damping = np.zeros(6 * views), 1e-3
-    for _ in range(_CYCLES):
+    for cycle in range(_CYCLES):
         largest = 0.0
         for softness in _SOFTNESS_PX:
             ball = measure_coherence(outlines, 128, power=False).ball
@@ -153,7 +157,9 @@ def _solve(outlines: Outlines, config: RefineConfig, free: Sequence[int]) -> Out
                 outlines, rays, step, damping = tried
                 change = change + step
             largest = max(largest, float(np.abs(change - before).reshape(views, 6)[:, :3].max()))
-        if largest < math.radians(_ENOUGH_DEG):
+        turned = math.degrees(largest)
+        log.info("poses by silhouettes: round %d of %d, turned by %.3f degrees", cycle + 1, _CYCLES, turned)
+        if turned < _ENOUGH_DEG:
             break
     return outlines
 
