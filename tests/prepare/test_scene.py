@@ -113,6 +113,20 @@ def test_poses_from_elsewhere_are_tried_on_the_silhouettes(photographs, with_mas
     assert "the silhouettes doubt the poses" in capsys.readouterr().out
 
 
+def test_without_masks_and_board_nothing_is_guessed(photographs, prepared, tmp_path, capsys):
+    folder = tmp_path / "photographs"
+    shutil.copytree(prepared / "images", folder / "images")
+    words = [str(folder), "--poses", str(prepared / "transforms.json"), "--out", str(tmp_path / "scene")]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "nothing says where the object is" in said and "--mask-source none" in said
+    assert not (tmp_path / "scene").exists()
+    assert main([*words, "--mask-source", "none", "--quiet"]) == 0
+    np.testing.assert_allclose(
+        views_of(tmp_path / "scene").cameras.world_from_camera, views_of(prepared).cameras.world_from_camera
+    )
+
+
 @pytest.mark.parametrize("tag", [1, 3, 6, 8])
 def test_cameras_turn_with_their_pictures(tag):
     K = torch.tensor([[300.0, 0, 110], [0, 310, 70], [0, 0, 1]], dtype=torch.float64)

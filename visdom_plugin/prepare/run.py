@@ -146,7 +146,7 @@ def _make(plan: Plan, root: Path, placed: Placed, asked: dict[str, Any], notes: 
     names = picture_names([p.name for p in placed.photographs])
     board = plan.board if placed.on_board else None
     masks, ways = choose_masks(plan.masks, cameras, images, given, names, board=board, where=plan.photographs)
-    tried = [] if placed.on_board else _try_poses(cameras, masks, names)
+    tried = [] if placed.on_board else _try_poses(cameras, masks, names, "grabcut" in ways)
     record: dict[str, Any] = {
         "asked": asked,
         "versions": {name: version(name) for name in ("visdom-plugin", "numpy")} | {"opencv": _opencv()},
@@ -175,8 +175,14 @@ def _turn_left(photograph: Photograph, shape: Sequence[int]) -> int:
     return 1 if upright or tag in _MIRRORED else tag
 
 
-def _try_poses(cameras: Cameras, masks: Sequence[np.ndarray | None], names: Sequence[str]) -> list[str]:
-    """What the silhouettes say of imported poses, one line each."""
+def _try_poses(
+    cameras: Cameras, masks: Sequence[np.ndarray | None], names: Sequence[str], guessed: bool
+) -> list[str]:
+    """What the silhouettes say of imported poses, one line each.
+
+    Args:
+        guessed: whether colours alone made some of the masks, which are then as doubtful as the poses.
+    """
     known = [(i, mask) for i, mask in enumerate(masks) if mask is not None]
     if len(known) < 2:
         return ["the poses could not be tried on silhouettes: there are no masks"]
@@ -184,9 +190,8 @@ def _try_poses(cameras: Cameras, masks: Sequence[np.ndarray | None], names: Sequ
     found = check(cameras[index], [mask for _, mask in known], names=[names[i] for i in index])
     doubts = [f"{f.sure}: {f.what}" for f in found.findings if f.kind in _GEOMETRY]
     fit = "" if found.fit is None else f" (they miss each other by {found.fit.score:.2f} px in the mean)"
-    return [f"the silhouettes doubt the poses: {d}" for d in doubts] or [
-        f"the silhouettes fit the poses{fit}"
-    ]
+    who = "masks and poses do not fit each other" if guessed else "the silhouettes doubt the poses"
+    return [f"{who}: {d}" for d in doubts] or [f"the silhouettes fit the poses{fit}"]
 
 
 def _say(view: dict[str, Any]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from visdom_plugin.errors import SceneError, list_some
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.prepare.masks.make import cut_views
-from visdom_plugin.prepare.masks.volume import board_volume, given_volume, looked_at_volume
+from visdom_plugin.prepare.masks.volume import board_volume, given_volume
 from visdom_plugin.prepare.settings import BoardSettings, MaskSettings
 from visdom_plugin.scene import NO_MASKS
 
@@ -59,7 +59,7 @@ def choose_masks(
                 cameras,
                 images,
                 names,
-                _find_box(settings, cameras, board),
+                _find_box(settings, board, where),
                 plane=board is not None,
                 rounds=settings.rounds,
             ),
@@ -79,9 +79,15 @@ def choose_masks(
     return list(kept), [way if mask is None else "given" for mask in given]
 
 
-def _find_box(settings: MaskSettings, cameras: Cameras, board: BoardSettings | None) -> np.ndarray:
+def _find_box(settings: MaskSettings, board: BoardSettings | None, where: Path) -> np.ndarray:
     if settings.box is not None:
         return given_volume(settings.box)
     if board is not None:
         return board_volume(board.size_m, settings.height)
-    return looked_at_volume(cameras)
+    raise SceneError(
+        "the photographs have no masks, and without a board nothing says where the object is",
+        where=where,
+        cause="poses of another program know no object",
+        todo="give masks (--masks DIR), a box in scene units (--box X0 Y0 Z0 X1 Y1 Z1), or networks "
+        "(--mask-source rembg); or leave masks to later: --mask-source none",
+    )

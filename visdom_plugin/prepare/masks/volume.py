@@ -8,11 +8,8 @@ import numpy as np
 import torch
 
 from visdom_plugin.errors import ConfigError, SceneError
-from visdom_plugin.geometry.cameras import Cameras, look_at_point, project
+from visdom_plugin.geometry.cameras import Cameras, project
 from visdom_plugin.prepare.settings import Volume
-
-_AROUND = 0.3
-"""Half the edge of the box about the point that cameras look at, in mean distances to it."""
 
 
 def board_volume(size_m: tuple[float, float], height: float | None) -> np.ndarray:
@@ -44,13 +41,6 @@ def given_volume(box: Volume) -> np.ndarray:
             todo="give x y z of the lower corner, then x y z of the upper one, in scene units",
         )
     return corners
-
-
-def looked_at_volume(cameras: Cameras) -> np.ndarray:
-    """(2, 3) corners of a box about the point that all cameras look at."""
-    middle = look_at_point(cameras).double()
-    reach = _AROUND * float((cameras.centres.double() - middle).norm(dim=-1).mean())
-    return np.stack([middle.numpy() - reach, middle.numpy() + reach])
 
 
 def outline_of_box(cameras: Cameras, box: np.ndarray, names: list[str]) -> list[np.ndarray]:
