@@ -16,6 +16,7 @@ from visdom_plugin.hull.inside import shape
 from visdom_plugin.hull.inside.config import InsideConfig
 from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.run import build, train
+from visdom_plugin.training.runs.saved_hulls import find_hull
 
 CPU = torch.device("cpu")
 DOMAIN = VisibleDomain(resolution=40)
@@ -100,6 +101,21 @@ def test_a_run_keeps_the_shape_and_does_not_search_again(scene, searches, tmp_pa
     path.write_text(json.dumps(json.loads(path.read_text()) | {"status": "interrupted"}))
     del searches[:]
     assert run()["metrics"]["test"] == record["metrics"]["test"] and not searches
+
+
+@pytest.mark.parametrize("without", [None, 1])
+def test_photographs_have_their_say_each_of_its_own_view(without):
+    views = make_scene(SyntheticConfig(size=48, train_views=5)).train
+    if without is not None:
+        views = replace(views, mask_origins=tuple("missing" if i == without else "given" for i in range(5)))
+    config = settings("3dgs-go+vd", inside=InsideConfig(photo_weight=0.4, photo_tolerance=0.1))
+    hull = find_hull(config, views, None)
+    left = views.take([i for i in range(5) if i != without])
+    alone = shape.shape_inside(hull, *left.silhouettes())
+    assert hull.inner == shape.shape_inside(
+        hull, *left.silhouettes(), config=config.inside, images=left.images
+    )
+    assert hull.inner.voxels < alone.voxels
 
 
 @pytest.mark.parametrize(
