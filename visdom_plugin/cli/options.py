@@ -208,7 +208,7 @@ def parse(
         prog=f"{prog} {WORD}{preset.name}",
         description=f"{preset.name}: {preset.description}. Defaults shown: {note}.",
         default=combined(**{f.name: getattr(common, f.name) for f in fields(Common)}, method=config),
-        args=early.rest,
+        args=[_spell_out(word) for word in early.rest],
         config=(tyro.conf.AvoidSubcommands,),
     )
     common = Common(**{f.name: getattr(parsed, f.name) for f in fields(Common)})
@@ -216,6 +216,12 @@ def parse(
         raise ConfigError(f"--snapshots {common.snapshots} is out of range", todo="give 0 or more")
     common = replace(common, budget=budget, data=common.scene_folder, folder=None)
     return Request(preset, parsed.method, common, note)
+
+
+def _spell_out(word: str) -> str:
+    """`--k` and `-k`, as the other commands spell K, as the method's setting."""
+    name, equals, value = word.partition("=")
+    return f"--method.hull.k{equals}{value}" if name in ("--k", "-k") else word
 
 
 def _find_method(early: Early) -> Early:

@@ -16,9 +16,8 @@ class HullSettings:
     """The keep rule, the grid it is asked on and the pieces that stay. Refuses values out of range when made."""
 
     k: int | Literal["n-1", "auto"] = 3
-    """K, the fewest views that must see a voxel. "n-1": all but one. "auto": 3, or 2
-    where 3 loses more of a mask. It is -k of visdom-hull and visdom-check, --method.hull.k of
-    visdom-train, hull.k in tables; the matrix of intrinsics has nothing to do with it."""
+    """K, the fewest views that must see a voxel. "n-1": all but one. "auto": 3, or 2 where 3 loses more of a mask.
+    It is --k of the commands and hull.k in tables; the matrix of intrinsics has nothing to do with it."""
     agreement: float = 0.95
     """Share of the views that see a voxel that must have it inside their mask, in (0, 1]."""
     max_misses: int | None = None

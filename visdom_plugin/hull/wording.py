@@ -17,6 +17,8 @@ class Wording(NamedTuple):
     look: str
     """Where each view's part in a hull is shown."""
     more_views: str
+    poses: str
+    """What to do about poses in another convention; "" leaves it to what was found."""
     sheet: str
     """Where views and outlines are shown."""
 
@@ -26,13 +28,15 @@ LIBRARY = Wording(
     allow_misses="VisibleDomain(max_misses=1)",
     look="see what visdom_plugin.hull.checks.check.check(cameras, masks) finds",
     more_views="use three views or more",
+    poses="",
     sheet="draw masks and hull over the photographs",
 )
 COMMANDS = Wording(
-    set_k="visdom-hull -k {k}, visdom-train --method.hull.k {k}",
+    set_k="--k {k}",
     allow_misses="visdom-hull --max-misses 1, visdom-train --method.hull.max-misses 1",
     look="look at each view's part in it: visdom-hull DIR --diagnose",
     more_views="use more views: --views 3 or more",
+    poses="change the poses in the scene's file: `visdom-check DIR` tells how",
     sheet="look at the contact sheet (visdom-check DIR --out OUT)",
 )
 _current: ContextVar[Wording] = ContextVar("wording", default=LIBRARY)

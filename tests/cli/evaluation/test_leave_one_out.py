@@ -241,7 +241,7 @@ def test_too_few_views_and_too_large_a_k_are_said_before_anything_runs(caplog):
     three = replace(scene, train=scene.train.take([0, 1, 3]))
     with pytest.raises(ConfigError, match="K = 3, but 2 views are left") as caught:
         check_views(three, config)
-    assert "--method.hull.k 2" in caught.value.todo
+    assert "--k 2" in caught.value.todo
     check_views(three, fake.FakeConfig(hull=VisibleDomain(k="n-1")))
     check_views(three, fake.FakeConfig(hull=VisibleDomain(kind="traditional")))
     check_views(three, fake.FakeConfig())

@@ -342,7 +342,7 @@ def test_a_k_that_asks_too_much_is_a_finding(captures):
     assert found.findings[0].todo.startswith("use K = 3 (VisibleDomain(k=3)), or views")
     with for_commands():
         said = examine(captures("built-in", 4), k=9).findings[0].todo
-    assert "(visdom-hull -k 3, visdom-train --method.hull.k 3)" in said
+    assert "(--k 3)" in said
 
 
 def test_spread_of_lines_of_sight():

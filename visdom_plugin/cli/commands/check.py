@@ -56,7 +56,7 @@ def _main(argv: Sequence[str]) -> int:
     options = tyro.cli(Options, args=list(argv), prog="visdom-check")
     folder = options.find_scene_folder()
     if options.k != "auto" and options.k < 1:
-        raise ConfigError(f"k is {options.k}", where="-k", todo="use a whole number from 1, or auto")
+        raise ConfigError(f"k is {options.k}", where="--k", todo="use a whole number from 1, or auto")
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         raise ConfigError("this is a file, not a folder", where=f"--out {options.out}", todo="name a folder")
     started = time.perf_counter()

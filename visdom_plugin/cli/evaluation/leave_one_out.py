@@ -137,12 +137,12 @@ def check_views(scene: Scene, config: object) -> None:
     if k > left:
         raise ConfigError(
             f"K = {k}, but {left} views are left when one of {views} is held out: no space is seen by {k} of them",
-            where="--method.hull.k",
-            todo=f"pass --method.hull.k {left}, or more --views",
+            where="--k",
+            todo=f"pass --k {left}, or more --views",
         )
     if k == left:
         log.info(
-            "K = %d of the %d views left: space must be seen by every one of them; with --method.hull.k %d the "
+            "K = %d of the %d views left: space must be seen by every one of them; with --k %d the "
             "hulls are closer to that of all %d views",
             k, left, max(k - 1, 1), views,
         )  # fmt: skip

@@ -26,7 +26,7 @@ from visdom_plugin.hull.checks.distance_fields import draw_outlines
 from visdom_plugin.hull.checks.findings import Finding, Name
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.settings import HullSettings
-from visdom_plugin.hull.wording import COMMANDS, wording
+from visdom_plugin.hull.wording import wording
 
 log = logging.getLogger(__name__)
 
@@ -169,8 +169,7 @@ def _todo(fault: Finding) -> str:
     if fault.kind != "axes":
         return fault.todo
     # A reader turns a file's poses into those of Cameras: which of the two is at fault is not seen here.
-    tells = "; `visdom-check DIR` tells what the scene's file holds wrongly" if wording() is COMMANDS else ""
-    return fault.todo + tells
+    return wording().poses or fault.todo
 
 
 def _known(silhouettes: Silhouettes) -> tuple[list[np.ndarray], list[np.ndarray | None]]:
