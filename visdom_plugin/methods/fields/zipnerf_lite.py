@@ -143,7 +143,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         losses = {"colour": (error.square() + CHARBONNIER**2).sqrt().mean()}
         if c.mask_weight:
             known = None if batch.mask_known is None else batch.mask_known.float()
-            losses["mask"] = c.mask_weight * self._silhouette_loss(levels, batch.mask, known)
+            losses["mask"] = c.mask_weight * self._silhouette_loss(levels, alpha, batch.mask, known)
         if c.interlevel_weight:
             proposals = (
                 antialiased_interlevel_loss(
@@ -166,18 +166,19 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         self, rays: LocalRays, radius: Tensor, step: int, generator: Generator
     ) -> Tensor:
         levels, _ = self._see(rays, radius, self.config.samples, step, generator)
-        return self._silhouette_loss(levels, torch.zeros_like(radius))
+        return self._silhouette_loss(levels, levels[-1].weights.sum(-1), torch.zeros_like(radius))
 
-    def _silhouette_loss(self, levels: list[Level], mask: Tensor, known: Tensor | None = None) -> Tensor:
-        """Of the field, and of the proposals as far as the config asks; a scalar. `mask`, `known` (n,)."""
+    def _silhouette_loss(
+        self, levels: list[Level], alpha: Tensor, mask: Tensor, known: Tensor | None = None
+    ) -> Tensor:
+        """Of the field, whose opacity is `alpha` (n,), and of the proposals as far as the config asks; a scalar.
+        `mask`, `known` (n,)."""
         c = self.config
-        shares = [c.proposal_mask_share] * (len(levels) - 1) + [1.0]
-        losses = [
-            share * mask_loss(level.weights.sum(-1), mask, known, clamp=c.mask_clamp)
-            for share, level in zip(shares, levels, strict=True)
-            if share
-        ]
-        return reduce(torch.add, losses)
+        loss = mask_loss(alpha, mask, known, clamp=c.mask_clamp)
+        for level in levels[:-1] if c.proposal_mask_share else ():
+            proposed = mask_loss(level.weights.sum(-1), mask, known, clamp=c.mask_clamp)
+            loss = loss + c.proposal_mask_share * proposed
+        return loss
 
     def optimise(self, step: int, output: StepOutput) -> None:
         c = self.config
