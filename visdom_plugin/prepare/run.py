@@ -24,6 +24,7 @@ from visdom_plugin.prepare.photographs import Photograph, find_photographs
 from visdom_plugin.prepare.placed import Placed, read_placed, turn_upright
 from visdom_plugin.prepare.poses.by_colmap import place_by_colmap
 from visdom_plugin.prepare.poses.find import holds_poses, place_by_file
+from visdom_plugin.prepare.refine import fit_to_masks
 from visdom_plugin.prepare.settings import BoardSettings, MaskSettings
 from visdom_plugin.prepare.sheet import draw_outlines
 
@@ -48,6 +49,8 @@ class Plan:
     poses: Path | None = None
     """File or folder of poses, BOARD or COLMAP; None takes those beside the photographs, or the board."""
     focal_35mm: float | None = None
+    refine_poses: bool = False
+    """Turn the cameras until the masks agree."""
     overwrite: bool = False
     board: BoardSettings = field(default_factory=BoardSettings)
     masks: MaskSettings = field(default_factory=MaskSettings)
@@ -146,6 +149,11 @@ def _make(plan: Plan, root: Path, placed: Placed, asked: dict[str, Any], notes: 
     names = picture_names([p.name for p in placed.photographs])
     board = plan.board if placed.on_board else None
     masks, ways = choose_masks(plan.masks, cameras, images, given, names, board=board, where=plan.photographs)
+    turned: list[dict[str, float]] = [{} for _ in names]
+    fitted = []
+    if plan.refine_poses:
+        cameras, turned, note = fit_to_masks(cameras, masks, ignored, names)
+        fitted = [note]
     tried = [] if placed.on_board else _try_poses(cameras, masks, names, "grabcut" in ways)
     record: dict[str, Any] = {
         "asked": asked,
@@ -154,10 +162,11 @@ def _make(plan: Plan, root: Path, placed: Placed, asked: dict[str, Any], notes: 
         "views": {
             p.name: {"picture": f"images/{n}.png", "orientation": p.orientation, "mask": way}
             | placed.views.get(p.name, {})
-            for p, n, way in zip(placed.photographs, names, ways, strict=True)
+            | moved
+            for p, n, way, moved in zip(placed.photographs, names, ways, turned, strict=True)
         },
         "left_out": placed.left_out,
-        "notes": [*notes, *placed.notes, *scene.notes[1:], *tried],
+        "notes": [*notes, *placed.notes, *scene.notes[1:], *fitted, *tried],
     }
     said = [_say(record["views"][p.name]) for p in placed.photographs]
     with write.appearing_folder(plan.out) as folder:

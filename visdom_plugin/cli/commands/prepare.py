@@ -46,6 +46,9 @@ class Options(BoardSettings):
     """Run COLMAP for poses (extra colmap); 10 photographs at least, better 20 to 50, that overlap."""
     focal_35mm: float | None = None
     """Focal length as its 35 mm equivalent, where the files have no EXIF data and the views do not tell it."""
+    refine_poses: bool = False
+    """Turn the cameras by what makes the masks agree: for poses that are off by up to a few degrees; six views or
+    more, and masks that you trust."""
     masks: str | None = None
     """Folder of masks that you have; by default one of a usual name in PHOTOS, or alpha channels."""
     mask_source: MaskWay = "auto"
@@ -108,6 +111,7 @@ def _main(argv: Sequence[str]) -> None:
         masks_folder=options.masks,
         poses=_find_poses(options),
         focal_35mm=options.focal_35mm,
+        refine_poses=options.refine_poses,
         overwrite=options.overwrite,
         board=board,
         masks=masks,
