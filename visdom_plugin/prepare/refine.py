@@ -54,7 +54,7 @@ def fit_to_masks(
     else:
         most = int(np.argmax(found.turned_deg))
         note = (
-            f"poses refined: masks miss each other by {found.after:.2f} px, {found.before:.2f} before; most turned "
-            f"is {names[known[most]]}, by {found.turned_deg[most]:.2f} degrees"
+            f"poses refined: masks miss each other by {found.after:.2f} px, {found.before:.2f} before; most "
+            f"turned is {names[known[most]]}, by {found.turned_deg[most]:.2f} degrees"
         )
     return Fitted(Cameras(cameras.intrinsics, motion, cameras.width, cameras.height), views, note)
