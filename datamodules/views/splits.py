@@ -87,7 +87,7 @@ def choose(
             _check_length(root, train_where, train, views)
             rules.append(f"training views of {train_where}")
         elif indexed:
-            _no_index_file(root, views, sorted(files))
+            _no_index_file(root, views, sorted(files), _spread_by_hand(root, count, views, request))
     if not request.test and train is not None:
         held = []
     elif request.test_list is not None:
@@ -174,16 +174,28 @@ def _index_files(root: Path) -> set[int]:
     return {int(stem) for stem in stems if stem.isascii() and stem.isdecimal() and len(stem) < 7}
 
 
-def _no_index_file(root: Path, views: int | None, available: list[int]) -> None:
+def _no_index_file(root: Path, views: int | None, available: list[int], by_hand: str | None) -> None:
     listed = ", ".join(map(str, available))
+    other = f"; or choose by hand, spread evenly for example: --train-list {by_hand}" if by_hand else ""
     raise SceneError(
         f"there is no sparse_{'<N>' if views is None else views}.txt"
         + (f"; this scene has index files for {listed} views" if available else ""),
         where=root,
-        todo=f"pass --views with one of {listed}"
+        todo=f"pass --views with one of {listed}{other}"
         if available
-        else "write the zero-based positions of the training views, one per line, into sparse_<N>.txt",
+        else f"write the zero-based positions of the training views, one per line, into sparse_<N>.txt{other}",
     )
+
+
+def _spread_by_hand(root: Path, count: int, views: int | None, request: Request) -> str | None:
+    """A list of as many views that are not for testing, as `--train-list` takes it; None where there is none."""
+    tested: list[int] = []
+    if (root / "sparse_test.txt").is_file():
+        tested, _ = _read(root, "sparse_test.txt", count, request.allow_outside)
+    free = sorted(set(range(count)) - set(tested))
+    if views is None or not 1 <= views <= min(len(free), _LISTED):
+        return None
+    return ",".join(map(str, pick_evenly(free, views)))
 
 
 def _check_length(root: Path, name: str, train: list[int], views: int) -> None:

@@ -292,6 +292,15 @@ def test_unavailable_views_list_the_available_ones(folder, views):
         load(folder, views=views)
 
 
+def test_the_list_that_is_advised_is_taken(folder):
+    """Advice leads into no second refusal."""
+    for views in (1, 2):
+        with pytest.raises(SceneError) as caught:
+            load(folder, views=views)
+        by_hand = caught.value.todo.split("--train-list ")[1].split()[0]
+        assert len(load(folder, train_list=by_hand).train) == views
+
+
 @pytest.mark.parametrize("downscale", [0.5, 0, -2, float("nan"), float("inf")])
 def test_impossible_downscales(folder, downscale):
     with pytest.raises(ConfigError, match="downscale"):
