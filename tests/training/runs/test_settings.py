@@ -79,13 +79,24 @@ class Maybe:
     rate: float | None = None
 
 
-def test_a_part_that_is_off_can_be_given_piece_by_piece():
-    assert from_plain(Maybe(), {"inner": {"k": 7}}, "f.yaml") == Maybe(inner=Inner(k=7))
-    assert from_plain(Maybe(inner=Inner(k=1)), {"inner": None}, "f.yaml") == Maybe()
-    with pytest.raises(ConfigError, match=r"unknown setting 'inner\.kk'"):
-        from_plain(Maybe(), {"inner": {"kk": 7}}, "f.yaml")
+@dataclass(frozen=True)
+class Hook:
+    hook: Maybe = Maybe()
+
+
+def test_a_part_of_a_hook_that_is_off_can_be_given_piece_by_piece():
+    assert from_plain(Hook(), {"hook": {"inner": {"k": 7}}}, "f") == Hook(Maybe(inner=Inner(k=7)))
+    assert from_plain(Hook(Maybe(inner=Inner(k=1))), {"hook": {"inner": None}}, "f") == Hook()
+    with pytest.raises(ConfigError, match=r"unknown setting 'hook\.inner\.kk'"):
+        from_plain(Hook(), {"hook": {"inner": {"kk": 7}}}, "f")
     with pytest.raises(ConfigError, match="rate cannot be"):
-        from_plain(Maybe(), {"rate": {"k": 7}}, "f.yaml")
+        from_plain(Maybe(), {"rate": {"k": 7}}, "f")
+
+
+def test_a_method_without_a_hull_gets_none_by_a_setting_of_it():
+    with pytest.raises(ConfigError, match="inner cannot be"):
+        from_plain(Maybe(), {"inner": {"k": 7}}, "f.yaml")
+    assert from_plain(Maybe(inner=Inner(k=1)), {"inner": None}, "f.yaml") == Maybe()
 
 
 def test_fields_left_out_keep_the_templates_values():

@@ -50,7 +50,8 @@ def from_plain(template: T, plain: Any, where: str, path: str = "") -> T:
                 f"unknown setting {full!r}", name, valid, where=where, todo=f"valid names at {label}"
             )
         current = getattr(template, name)
-        if current is None and isinstance(value, dict):
+        # A part of a hook may be switched on by its parts; a method without a hull or a hook stays without.
+        if current is None and isinstance(value, dict) and path:
             current = _blank(hints[name])
         if is_dataclass(current) and isinstance(value, dict):
             changes[name] = from_plain(current, value, where, full)
