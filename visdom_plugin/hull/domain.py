@@ -84,9 +84,12 @@ class VisibleDomain(HullSettings):
 
             raise explain_one_point(self, cameras, silhouettes)
         if may_be_other_units(cameras):
-            from visdom_plugin.hull.checks.explain_failure import refuse_other_unit
-
-            refuse_other_unit(cameras, silhouettes)
+            try:
+                from visdom_plugin.hull.checks.explain_failure import refuse_other_unit
+            except ImportError:
+                log.info("without OpenCV nobody looks whether focal lengths are in another unit than pixels")
+            else:
+                refuse_other_unit(cameras, silhouettes)
         settings = self._in_bounds(cameras)
         if self.k == "auto" and self.kind != "released-go":
             from visdom_plugin.hull.checks.covisibility import advise_k

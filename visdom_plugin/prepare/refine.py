@@ -10,9 +10,7 @@ import torch
 
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.hull.refine.poses import refine_poses
-
-_LEAST = 3
+from visdom_plugin.hull.refine.poses import LEAST_VIEWS, refine_poses
 
 
 class Fitted(NamedTuple):
@@ -34,14 +32,14 @@ def fit_to_masks(
     """Turns the cameras of the views that have masks until the masks agree better.
 
     Raises:
-        SceneError: fewer than three views have masks.
+        SceneError: fewer than LEAST_VIEWS views have masks.
     """
     known = [i for i, mask in enumerate(masks) if mask is not None]
-    if len(known) < _LEAST:
+    if len(known) < LEAST_VIEWS:
         raise SceneError(
             f"poses are refined by masks, and {len(known)} of {len(masks)} views have one",
             where="--refine-poses",
-            todo=f"give masks for {_LEAST} views or more (--masks, --mask-source), or leave --refine-poses out",
+            todo=f"give masks for {LEAST_VIEWS} views or more (--masks, --mask-source), or no --refine-poses",
         )
     found = refine_poses(cameras[known], [m for m in masks if m is not None], [ignored[i] for i in known])
     motion = cameras.world_from_camera.clone()

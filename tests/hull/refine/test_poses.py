@@ -7,7 +7,7 @@ import torch
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
 from tests.geometry.pointing import pointing_error
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.distance_fields import Outlines, draw_outlines
@@ -187,3 +187,11 @@ def test_settings_out_of_range_are_refused(noisy):
     for config in (RefineConfig(turn_deg=0.0), RefineConfig(move=1.0), RefineConfig(turn_deg=float("nan"))):
         with pytest.raises(ConfigError, match="RefineConfig"):
             refine_poses(noisy.train.cameras, noisy.train.masks, config=config)
+
+
+def test_few_views_are_refused_unless_one_camera_is_free():
+    train = scene(4, 1.0).train
+    with pytest.raises(SceneError, match="6 views or more"):
+        refine_poses(train.cameras, train.masks)
+    found = refine_poses(train.cameras, train.masks, free=[1])
+    assert found.after <= found.before

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import Masks, gather_silhouettes
 from visdom_plugin.hull.checks.distance_fields import Outlines, draw_outlines
@@ -40,6 +40,10 @@ _WORDS = 40
 """Independent words in the outline of one mask: neighbouring rays repeat each other."""
 _ENOUGH_DEG = 0.005
 """No turn in a round of a whole cycle is larger: that is the end."""
+LEAST_VIEWS = 6
+"""Fewer views leave the turns of all cameras open: with four, masks agree best far from the truth."""
+_MOST_SPREADS = 4.0
+"""A turn of so many standard deviations is no correction: nothing is changed then."""
 _AGREE_PX = 0.01
 """Mean residual below which masks agree already and nothing is changed."""
 
@@ -95,15 +99,23 @@ def refine_poses(
 
     Raises:
         ConfigError: a field of the config is out of range.
-        SceneError: cameras and masks do not belong together (as `carve`).
+        SceneError: cameras and masks do not belong together (as `carve`); or fewer than LEAST_VIEWS views, unless
+            only one camera is free, which needs three.
     """
     config = config or RefineConfig()
     config.check()
+    least = LEAST_VIEWS if free is None or len(free) > 1 else 3
+    if len(cameras) < least:
+        raise SceneError(
+            f"poses are refined by the masks of {least} views or more, and these are {len(cameras)}",
+            cause="fewer leave open how the cameras are turned: masks agree as well far from the truth",
+            todo="use more views, or free one camera only",
+        )
     outlines = draw_outlines(cameras, gather_silhouettes(cameras, masks, ignore), object_px=_OBJECT_PX)
     before = measure_coherence(outlines, power=False).score
     zeros = np.zeros(len(cameras))
     still = Refined(cameras, zeros, zeros, before, before)
-    if len(cameras) < 3 or before <= _AGREE_PX:
+    if before <= _AGREE_PX:
         return still
     found = _solve(outlines, config, range(len(cameras)) if free is None else free)
     after = measure_coherence(found, power=False).score if found else before
@@ -118,6 +130,11 @@ def refine_poses(
     motion[:, :3, 3] = torch.as_tensor(found.centres).to(motion)
     shift = np.linalg.norm(found.centres - outlines.centres, axis=1) / _distances(found)
     turned = np.degrees(np.arctan2(sine, cosine))
+    if turned.max() > _MOST_SPREADS * config.turn_deg:
+        log.warning(
+            "poses are kept: masks would agree better only with a camera turned by %.1f degrees", turned.max()
+        )
+        return still
     refined = Cameras(cameras.intrinsics, motion, cameras.width, cameras.height)
     return Refined(refined, turned, shift, before, after)
 

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines
 from visdom_plugin.hull.checks.findings import Finding, Sure
-from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
+
+if TYPE_CHECKING:
+    from visdom_plugin.hull.checks.distance_fields import Outlines
 
 LEAST, LARGEST_ANGLE, LARGEST_MM = 5.0, 170.0, 600.0
 """Focal lengths from the first on and up to the others may be degrees, or millimetres."""
@@ -47,6 +48,10 @@ def find_other_unit(cameras: Cameras, outlines: Outlines) -> tuple[list[Finding]
     Args:
         cameras: (N,) the ones of the outlines.
     """
+    # Every carve asks `may_be_other_units`; the masks are compared only then, and by OpenCV.
+    from visdom_plugin.hull.checks.distance_fields import OBJECT_PX
+    from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
+
     focal, size = _numbers(cameras)
     readings = list(_readings(focal, size))
     if not readings or len(outlines) < 2:
