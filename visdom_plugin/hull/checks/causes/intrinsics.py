@@ -49,6 +49,7 @@ def find_other_unit(cameras: Cameras, outlines: Outlines) -> tuple[list[Finding]
         cameras: (N,) the ones of the outlines.
     """
     # Every carve asks `may_be_other_units`; the masks are compared only then, and by OpenCV.
+    from visdom_plugin.hull.checks.causes.fault_hypotheses import find_causes
     from visdom_plugin.hull.checks.distance_fields import OBJECT_PX
     from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
 
@@ -68,6 +69,10 @@ def find_other_unit(cameras: Cameras, outlines: Outlines) -> tuple[list[Finding]
         trials.append((measure_coherence(changed, rays), reading, changed))
     after, best, changed = min(trials, key=lambda trial: trial[0].score)
     if after.score > min(_RATIO * fit.score, _MOST_PX) or after.power < _POWER * fit.power:
+        return [], outlines
+    # Poses with other axes look into the object's mirror image; a wide enough lens explains that, too.
+    causes, left, _ = find_causes(outlines, brief=True)
+    if any(cause.kind == "axes" for cause in causes) and left.score < after.score:
         return [], outlines
     rivals = [
         r.what for f, r, _ in trials if r is not best and f.score <= max(2 * after.score, _LEAST_PX / 2)
