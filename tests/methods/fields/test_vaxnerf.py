@@ -118,7 +118,7 @@ def test_selected_samples_are_those_of_the_slow_twin():
 
 def test_the_filter_is_the_hull(shards):
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    points = torch.as_tensor(shards.bounds[0]) + points * torch.as_tensor(np.ptp(shards.bounds, axis=0))
+    points = torch.tensor(shards.bounds[0]) + points * torch.as_tensor(np.ptp(shards.bounds, axis=0))
     keep = VisDomSampler(shards, drop_outside=True).keep(points)
     assert torch.equal(keep, shards.contains(points)) and keep.any() and not keep.all()
     assert VisDomSampler(shards).keep(points).all()
