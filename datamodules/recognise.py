@@ -135,8 +135,14 @@ def opening(path: str | Path) -> Iterator[Path]:
         ) from error
 
 
-def find_folder(path: str | Path) -> Path:
+_SCENE_TODO = "pass --data with the folder of a scene, or leave it out for the built-in scene"
+
+
+def find_folder(path: str | Path, todo: str = _SCENE_TODO) -> Path:
     """The folder of that name.
+
+    Args:
+        todo: what to do where there is none.
 
     Raises:
         SceneError: there is none.
@@ -151,7 +157,7 @@ def find_folder(path: str | Path) -> Path:
         raise SceneError(
             "this is a file, not a folder" if exists else "there is no such folder",
             where=root,
-            todo="pass --data with the folder of a scene, or leave it out for the built-in scene",
+            todo=todo,
         )
     return root
 

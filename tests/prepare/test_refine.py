@@ -49,5 +49,5 @@ def test_without_masks_there_is_nothing_to_refine_by(capture, tmp_path, capsys):
     folder, _, _ = capture
     words = [str(folder), "--out", str(tmp_path / "scene"), "--mask-source", "none", "--refine-poses"]
     assert main(words) == 2
-    assert "poses are refined by masks" in capsys.readouterr().err
+    assert "poses are refined by masks of 6 views or more; 0 of 7" in capsys.readouterr().err
     assert not (tmp_path / "scene").exists()

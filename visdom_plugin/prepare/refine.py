@@ -37,9 +37,9 @@ def fit_to_masks(
     known = [i for i, mask in enumerate(masks) if mask is not None]
     if len(known) < LEAST_VIEWS:
         raise SceneError(
-            f"poses are refined by masks, and {len(known)} of {len(masks)} views have one",
+            f"poses are refined by masks of {LEAST_VIEWS} views or more; {len(known)} of {len(masks)} have one",
             where="--refine-poses",
-            todo=f"give masks for {LEAST_VIEWS} views or more (--masks, --mask-source), or no --refine-poses",
+            todo="add photographs or masks (--masks, --mask-source), or leave --refine-poses out",
         )
     found = refine_poses(cameras[known], [m for m in masks if m is not None], [ignored[i] for i in known])
     motion = cameras.world_from_camera.clone()

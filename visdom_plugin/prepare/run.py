@@ -74,7 +74,9 @@ def prepare(plan: Plan) -> Prepared:
         SceneError: for faults of the photographs.
         ConfigError: for settings that cannot be.
     """
-    root = find_folder(plan.photographs)
+    root = find_folder(
+        plan.photographs, todo="name the folder that the photographs are in: visdom-prepare PHOTOS"
+    )
     _check(plan, root)
     with opening(root):
         photographs, notes = find_photographs(root)

@@ -57,10 +57,13 @@ def _evaluate(argv: Sequence[str]) -> int:
     if record["status"] != "finished" and not options.quiet:
         say(f"the run is {record['status']}: this is its state after {step} steps")
     quiet = options.quiet
+    if options.oracle:
+        from visdom_plugin.cli.evaluation.select_on_test import find_snapshots, select_on_test
+
+        # Before the views are measured, which takes a while.
+        find_snapshots(options.run)
     record = evaluate_again(method, config, hull, scene, device=device, run_dir=options.run, quiet=quiet)
     if options.oracle:
-        from visdom_plugin.cli.evaluation.select_on_test import select_on_test
-
         record = select_on_test(method, scene.test, device=device, run_dir=options.run)
     if not quiet:
         show_result(record, options.run)

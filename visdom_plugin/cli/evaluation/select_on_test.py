@@ -25,6 +25,22 @@ log = logging.getLogger(__name__)
 WARNING = "chosen on the test views; not a result of the method"
 
 
+def find_snapshots(run_dir: Path) -> list[int]:
+    """Steps of the snapshots that a run kept.
+
+    Raises:
+        CheckpointError: there are none.
+    """
+    steps = checkpoints.list_steps(Path(run_dir) / SNAPSHOTS)
+    if not steps:
+        raise CheckpointError(
+            "the run kept no snapshots to choose from",
+            where=run_dir,
+            todo="train it again with --snapshots 10 --overwrite",
+        )
+    return steps
+
+
 def select_on_test(method: Method, views: Views, *, device: torch.device, run_dir: Path) -> Record:
     """Measures every snapshot of a run on the test views and notes the one of the highest mean PSNR.
 
@@ -41,14 +57,7 @@ def select_on_test(method: Method, views: Views, *, device: torch.device, run_di
             directory.
         SceneError: when no test view can be measured.
     """
-    folder = Path(run_dir) / SNAPSHOTS
-    steps = checkpoints.list_steps(folder)
-    if not steps:
-        raise CheckpointError(
-            "the run kept no snapshots to choose from",
-            where=run_dir,
-            todo="train it again with --snapshots 10 --overwrite",
-        )
+    folder, steps = Path(run_dir) / SNAPSHOTS, find_snapshots(run_dir)
     if all(views.mask_origin(i) != "given" for i in range(len(views))):
         raise SceneError(
             "the scene has no test view that can be measured, so that there is nothing to choose by",

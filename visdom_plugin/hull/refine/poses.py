@@ -98,12 +98,14 @@ def refine_poses(
         free: the views whose cameras may be turned; all by default.
 
     Raises:
-        ConfigError: a field of the config is out of range.
+        ConfigError: a field of the config, or a view that is free, is out of range.
         SceneError: cameras and masks do not belong together (as `carve`); or fewer than LEAST_VIEWS views, unless
             only one camera is free, which needs three.
     """
     config = config or RefineConfig()
     config.check()
+    if free is not None and not all(0 <= i < len(cameras) for i in free):
+        raise ConfigError(f"free is {list(free)}", todo=f"give positions from 0 to {len(cameras) - 1}")
     least = LEAST_VIEWS if free is None or len(free) > 1 else 3
     if len(cameras) < least:
         raise SceneError(
