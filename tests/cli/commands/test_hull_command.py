@@ -25,9 +25,9 @@ def scene(monkeypatch):
 
     cameras = ring(4)
     masks = ball_masks(cameras, [((0.1, 0, 0), 0.5)])
-    views = Views(
-        cameras, [m[..., None].expand(96, 96, 3) for m in masks], masks, [f"v{i}.png" for i in range(4)]
-    )
+    # Of another grey in each view, so that no two photographs agree.
+    images = [(m[..., None].expand(96, 96, 3) * (60 * i)).byte() for i, m in enumerate(masks)]
+    views = Views(cameras, images, masks, [f"v{i}.png" for i in range(4)])
     asked = []
 
     def load(path, **keywords):
@@ -71,6 +71,21 @@ def test_the_shape_inside_is_reported_and_written_like_a_hull(scene, capsys, tmp
     assert trimesh.load(tmp_path / "inner.ply").volume == pytest.approx(inner["volume"], rel=0.1)
     assert main([*words, "--inside"]) == 0
     assert "of the hull's volume" in capsys.readouterr().out
+
+
+def test_radius_and_photographs_change_the_shape_inside(scene, capsys):
+    def measure(*more):
+        assert main(["somewhere", "--resolution", "48", "-k", "2", "--inside", "--json", *more]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    plain, round_, seen = measure(), measure("--inside-radius", "1"), measure("--photo-weight", "0.3")
+    assert (plain["radius"], plain["photo_weight"]) == (2.0, 0.0)
+    assert measure("--inside-radius", "2", "--photo-weight", "0")["volume"] == plain["volume"]
+    # The smaller the radius, the more of the corners stays.
+    assert round_["volume"] > plain["volume"] and round_["radius"] == 1
+    assert seen["volume"] != plain["volume"] and seen["photo_weight"] == 0.3
+    assert main(["somewhere", "--photo-weight", "0.15"]) == 2
+    assert "add --inside" in capsys.readouterr().err
 
 
 def test_the_shape_inside_of_what_one_view_sees_is_refused(scene, capsys):

@@ -16,6 +16,7 @@ from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.inside.config import InsideConfig
 from visdom_plugin.hull.settings import HullSettings
 
 if TYPE_CHECKING:
@@ -39,6 +40,11 @@ class Options(FolderOptions, HullSettings):
     """K, the fewest views that must see a voxel. n-1: all but one. auto: 3, or 2 where 3 loses more of a mask."""
     inside: bool = False
     """Report and write, in place of the hull, the smoothest shape inside it that covers the masks as well."""
+    inside_radius: float | None = None
+    """With --inside: what no silhouette holds is rounded to this radius, in hull radii; by default 2, as in
+    visdom-gs. visdom-field takes 1."""
+    photo_weight: float | None = None
+    """With --inside: how much the photographs have a say, 0 to 0.5; by default 0. visdom-gs takes 0.15."""
     out: Path | None = None
     """File to write: .ply, .obj or .glb for the mesh, .npz for the grid."""
     masks_out: Path | None = None
@@ -71,6 +77,7 @@ def _main(argv: Sequence[str]) -> None:
         )
     names = [f.name for f in fields(VisibleDomain)]
     domain = VisibleDomain(**{name: getattr(options, name) for name in names})
+    inside = _inside_config(options)
     if options.frames < 1:
         raise ConfigError(f"--frames is {options.frames}; it must be at least 1")
     from visdom_plugin.cli.scenes import open_scene
@@ -85,12 +92,29 @@ def _main(argv: Sequence[str]) -> None:
         test=masks is not None and masks.cameras == "test",
     )
     report = report_hull(
-        domain, scene, out=options.out, diagnosing=options.diagnose, masks=masks, inside=options.inside
+        domain, scene, out=options.out, diagnosing=options.diagnose, masks=masks, inside=inside
     )
     if options.json:
         sys.stdout.write(json.dumps(report) + "\n")
     elif not options.quiet:
         sys.stdout.write(_table(report))
+
+
+def _inside_config(options: Options) -> InsideConfig | None:
+    """What is asked of the shape inside; None where it is not."""
+    radius, weight = options.inside_radius, options.photo_weight
+    if options.inside:
+        default = InsideConfig()
+        return InsideConfig(
+            radius=default.radius if radius is None else radius,
+            photo_weight=default.photo_weight if weight is None else weight,
+        )
+    if radius is not None or weight is not None:
+        raise ConfigError(
+            "--inside-radius and --photo-weight are about the shape inside the hull, which is not asked for",
+            todo="add --inside",
+        )
+    return None
 
 
 @dataclass(frozen=True)
@@ -110,9 +134,9 @@ def report_hull(
     out: Path | None = None,
     diagnosing: bool = False,
     masks: MaskRequest | None = None,
-    inside: bool = False,
+    inside: InsideConfig | None = None,
 ) -> dict[str, Any]:
-    """Carves, measures and writes one hull, or the shape inside it, and its masks.
+    """Carves, measures and writes one hull, or, with `inside`, the shape inside it, and its masks.
 
     Returns:
         Plain numbers and lists, ready for JSON.
@@ -127,10 +151,11 @@ def report_hull(
     given = [i for i in range(len(views)) if views.mask_origin(i) == "given"]
     names, known = [views.names[i] for i in given], [views.demanded(i) for i in given]
     hull = outer = domain.carve(cameras, silhouettes, ignore)
-    if inside:
+    if inside is not None:
         from visdom_plugin.hull.inside.shape import shape_inside
 
-        hull = shape_inside(outer, cameras, silhouettes, ignore)
+        photographs = [views.images[i] for i in views.with_masks()]
+        hull = shape_inside(outer, cameras, silhouettes, ignore, inside, photographs)
     coverage = measure_coverage(hull, cameras, silhouettes, ignore)
     summary = hull.summary
     report = {
@@ -159,11 +184,12 @@ def report_hull(
         "watertight": is_closed(hull.to_mesh()[1]),
         "agreement_means": summary["agreement_means"],
     }
-    if inside:
+    if inside is not None:
         report |= {
             "hull_volume": outer.volume,
             "hull_seconds": outer.summary["seconds"],
             "radius": summary["radius"],
+            "photo_weight": inside.photo_weight,
         }
     if diagnosing:
         report["diagnosis"] = _diagnose(scene, report)
@@ -215,6 +241,8 @@ def _inside_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         return []
     share = report["volume"] / report["hull_volume"]
     text = f"{share:.1%} of the hull's volume, rounded to {report['radius']:g} of its radius"
+    if report["photo_weight"]:
+        text += f", photographs have a say of {report['photo_weight']:g}"
     return [("inside", text)]
 
 
