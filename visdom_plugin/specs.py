@@ -34,6 +34,17 @@ class Settings(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
 
+def check_requirements(config: object) -> None:
+    """Asks a config that has such a method whether all is there that training takes from outside.
+
+    Raises:
+        PluginError: something is not.
+    """
+    check = getattr(config, "check_requirements", None)
+    if check is not None:
+        check()
+
+
 @dataclass(frozen=True)
 class Preset:
     """One variant of a method, as people type it, with its settings."""

@@ -14,6 +14,8 @@ from visdom_plugin.tables.results import Results
 from visdom_plugin.tables.run.jobs import plan
 from visdom_plugin.tables.spec import list_tables, load_table
 
+NEED_WEIGHTS = {"gaussianobject", "gaussianobject+vd"}
+"""Not available where the networks that they take are not."""
 EDITIONS = [(name, edition) for name in list_tables() for edition in (None, *load_table(name).editions)]
 
 
@@ -37,7 +39,7 @@ def test_every_row_resolves_and_protocols_do_not_mix(name, edition, tmp_path):
     spec = load_table(name, edition)
     made = plan(spec, tmp_path, make_workshop("cpu"))
     missing = {spec.rows[job.row].method for job, o in made.jobs.items() if o.status == "not available"}
-    assert missing <= list_not_built()
+    assert missing <= list_not_built() | NEED_WEIGHTS
     if edition == "smoke":
         assert {c.root for c in spec.columns} == {"built-in"} and len(spec.seeds) == 1
         assert len({job.run_dir for job in made.jobs if job.run_dir}) >= len(spec.rows) - len(missing)

@@ -6,6 +6,8 @@ import pytest
 
 from visdom_plugin import registry
 from visdom_plugin.conformance.subject import Subject
+from visdom_plugin.errors import PluginError
+from visdom_plugin.specs import check_requirements
 
 
 def pytest_generate_tests(metafunc) -> None:
@@ -14,6 +16,17 @@ def pytest_generate_tests(metafunc) -> None:
     known = registry.installed()
     subjects = [Subject(known, name) for name in metafunc.config.getoption("visdom_methods")]
     metafunc.parametrize("subject", subjects, ids=lambda s: s.name, scope="session")
+
+
+@pytest.fixture(autouse=True)
+def requirements(request):
+    """Skips the checks of a method that lacks something from outside, such as weights."""
+    if "subject" in request.fixturenames:
+        subject = request.getfixturevalue("subject")
+        try:
+            check_requirements(subject.config)
+        except PluginError as error:
+            pytest.skip(f"{subject.name} cannot be trained here: {error.what}")
 
 
 @pytest.fixture

@@ -90,7 +90,11 @@ class Method(Protocol):
 
     A method with a `pixels_per_step(step) -> int` is handed that many pixels of all views per step
     (`PixelBatch`), any other one a whole view (`ViewBatch`). The number may depend on the method's state, which
-    then is part of `state_dict`.
+    then is part of `state_dict`. Of the others, one with a `view_at(step) -> int | None` says which training view
+    that is, by its number; None leaves it to the trainer, which goes through all of them in turn.
+
+    A config with a `check_requirements()` is asked before anything else whether all is there that training needs
+    from outside, such as packages and weights; it raises a PluginError that says what is missing.
 
     A method with a `summary() -> dict[str, int]` has these numbers, {"gaussians": 6000}, shown while it trains
     and noted in run.json's `model`.

@@ -19,7 +19,7 @@ from visdom_plugin.errors import CheckpointError, ConfigError, EmptyHullError, P
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import Scene, Views
-from visdom_plugin.specs import Settings
+from visdom_plugin.specs import Settings, check_requirements
 from visdom_plugin.training.evaluate import carve_reference, evaluate
 from visdom_plugin.training.live import SHEET, Live, LivePictures, TensorBoard
 from visdom_plugin.training.local_method import LocalMethod, move_near
@@ -39,7 +39,10 @@ class Batches(Protocol):
     """What training draws of the views, pure functions of the step; `batches.DataManager` makes them."""
 
     def view_batch(self, step: int) -> Batch:
-        """A whole view."""
+        """The whole view of a step."""
+
+    def view(self, index: int) -> Batch:
+        """A whole view by its number."""
 
     def pixel_batch(self, step: int, n: int) -> Batch:
         """`n` pixels of all views."""
@@ -104,10 +107,12 @@ def train(
         EmptyHullError: when the config's hull is empty.
         TrainingError: when the optimisation diverges.
         Interrupted: after Ctrl-C or SIGTERM; the same call resumes it.
-        PluginError: TensorBoard's files are asked for, and the package is not installed.
+        PluginError: TensorBoard's files are asked for, and the package is not installed; or something is missing
+            that the method needs, such as weights.
     """
     board = None if tensorboard is None else TensorBoard(tensorboard)
     preset = registry.find(preset_name)
+    check_requirements(config)
     device = torch.device(device)
     scene = add_points(scene, preset, getattr(config, "hull", None))
     identity = {
@@ -222,10 +227,17 @@ def _run(
 
 def choose_batches(method: Method, batches: Batches) -> Callable[[int], Batch]:
     """Whole views, or pixels for a method that says how many of them it wants."""
-    pixels = getattr(method, "pixels_per_step", None)
-    if pixels is None:
+    pixels, view_at = (getattr(method, name, None) for name in ("pixels_per_step", "view_at"))
+    if pixels is not None:
+        return lambda step: batches.pixel_batch(step, pixels(step))
+    if view_at is None:
         return batches.view_batch
-    return lambda step: batches.pixel_batch(step, pixels(step))
+
+    def chosen(step: int) -> Batch:
+        view = view_at(step)
+        return batches.view_batch(step) if view is None else batches.view(view)
+
+    return chosen
 
 
 def _warn_of_changes(before: Record, now: Record) -> None:

@@ -7,7 +7,8 @@ import logging
 from collections.abc import Sequence
 
 from visdom_plugin.cli.table_parts.table_data import DataHasher, tidy_reading
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, PluginError
+from visdom_plugin.specs import check_requirements
 from visdom_plugin.tables.run.jobs import Resolved, Workshop
 from visdom_plugin.tables.spec import list_tables, load_table
 
@@ -84,4 +85,10 @@ def _resolve(kind: str, method: str, budget: str, device: str, executor: str | N
         _refuse_misspelt(method, [*known.presets, *known.aliases])
         log.warning("not available: no installed package offers %r", method)
         return None
-    return Resolved(preset.name, budget, preset.settings(budget))
+    config = preset.settings(budget)
+    try:
+        check_requirements(config)
+    except PluginError as error:
+        log.warning("not available: %s\n%s", preset.name, error)
+        return None
+    return Resolved(preset.name, budget, config)
