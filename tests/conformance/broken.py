@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from my_method.field import Field as WholeField
 
-from method_configs import corgs_lite, gs_go, ingp, visdom_field, visdom_gs, zipnerf_lite
+from method_configs import corgs_lite, fsgs_lite, gs_go, ingp, visdom_field, visdom_gs, zipnerf_lite
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
 from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.domain import VisibleDomain
@@ -356,6 +356,7 @@ def _methods() -> list[MethodSpec | Preset]:
         )
     found += _splat_presets("SmallGsGo", "visdom_plugin.methods.splats.gs_go:GsGo", gs_go)
     found += _splat_presets("SmallCorgs", "visdom_plugin.methods.splats.corgs_lite:CorgsLite", corgs_lite)
+    found += _splat_presets("SmallFsgs", "visdom_plugin.methods.splats.fsgs.method:FsgsLite", fsgs_lite)
     found.append(
         _recipe("SmallVisdomGs", visdom_gs, SMALL_SPLATS | {"vd": RegularizerConfig(enabled=True, bank=4)})
     )
@@ -383,6 +384,7 @@ WHOLE = (
     "SmallField",
     "SmallGsGo",
     "SmallCorgs",
+    "SmallFsgs",
     "SmallVisdomGs",
     "SmallIngp",
     "SmallVisdomField",

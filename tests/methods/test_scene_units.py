@@ -15,7 +15,7 @@ from visdom_plugin.training.evaluate import carve_reference, evaluate
 from visdom_plugin.training.run import build, choose_batches
 
 CPU = torch.device("cpu")
-VARIANTS = ("ingp+vd", "zipnerf-lite+vd", "3dgs-go+vd", "corgs-lite+vd", "3dgs-go")
+VARIANTS = ("ingp+vd", "zipnerf-lite+vd", "3dgs-go+vd", "corgs-lite+vd", "3dgs-go", "fsgs-lite+vd")
 EXACT = (2.0**-20, 2.0**12)
 """Powers of two change no mantissa: every number must stay as it is, to the last bit."""
 OTHER = (0.002, 1e3)

@@ -8,12 +8,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
-from method_configs import corgs_lite, gs_go, ingp, zipnerf_lite
+from method_configs import corgs_lite, fsgs_lite, gs_go, ingp, zipnerf_lite
 from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.fields.ingp import Ingp
 from visdom_plugin.methods.fields.zipnerf_lite import ZipNerfLite
 from visdom_plugin.methods.splats.corgs_lite import CorgsLite
+from visdom_plugin.methods.splats.fsgs.method import FsgsLite
 from visdom_plugin.methods.splats.gs_go import GsGo
 from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 from visdom_plugin.training.batches import DataManager
@@ -23,6 +24,7 @@ GRID = HashLayout(3, 1, base_resolution=8, max_resolution=32, log2_table_size=10
 SPLATS = {
     GsGo: replace(gs_go.SPEC.quick, steps=40, initial_points=300, depth_weight=0.0),
     CorgsLite: replace(corgs_lite.SPEC.quick, steps=40, initial_points=300),
+    FsgsLite: replace(fsgs_lite.SPEC.quick, steps=40, initial_points=300),
 }
 METHODS = SPLATS | {
     Ingp: replace(
@@ -53,7 +55,9 @@ class ReadNumbers(TorchDispatchMode):
 
 @pytest.fixture(scope="module")
 def scene():
-    return make_scene(SyntheticConfig(size=48))
+    made = make_scene(SyntheticConfig(size=48))
+    depths = tuple(1 + image.float().mean(-1) / 255 for image in made.train.images)
+    return replace(made, train=replace(made.train, mono_depths=depths))
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,5 @@
-"""Where Gaussians are added and removed (Kerbl et al. 2023, section 5; GaussianObject's floater removal).
+"""Where Gaussians are added and removed (Kerbl et al. 2023, section 5; GaussianObject's floater removal; FSGS's
+unpooling).
 
 Pure functions that say what to change; GaussianOptimiser carries it out.
 """
@@ -6,6 +7,7 @@ Pure functions that say what to change; GaussianOptimiser carries it out.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +26,7 @@ def initial_log_scales(means: Tensor) -> Tensor:
     Returns:
         (N, 3).
     """
-    squared = _squared_neighbour_distances(means, min(4, len(means)))[:, 1:]
+    squared = _neighbours(means, min(4, len(means)))[0][:, 1:]
     mean = squared.mean(-1) if squared.shape[1] else torch.ones(len(means))
     return 0.5 * mean.clamp_min(1e-14).log().to(means)[:, None].repeat(1, 3)
 
@@ -42,17 +44,64 @@ def stray_gaussians(means: Tensor, sigmas: float) -> Tensor:
     Returns:
         (N,) bool, True for stray ones.
     """
-    squared = _squared_neighbour_distances(means, max(1, math.isqrt(len(means))))
+    squared = _neighbours(means, max(1, math.isqrt(len(means))))[0]
     return (squared.mean(-1) >= squared.mean() + sigmas * squared.std()).to(means.device)
 
 
-def _squared_neighbour_distances(means: Tensor, count: int) -> Tensor:
-    """(N, count) ascending, the first is the point itself."""
+def _neighbours(means: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """(N, count) squared distances, ascending, and the points' indices, on the CPU; the point itself is one."""
     from scipy.spatial import cKDTree
 
     points = means.detach().double().cpu().numpy()
-    distances, _ = cKDTree(points).query(points, k=count, workers=-1)
-    return torch.from_numpy(np.asarray(distances, dtype=np.float64).reshape(len(points), count) ** 2)
+    distances, nearest = cKDTree(points).query(points, k=count, workers=-1)
+    squared, found = (np.asarray(x).reshape(len(points), count) for x in (distances**2, nearest))
+    return torch.from_numpy(squared), torch.from_numpy(found)
+
+
+NEIGHBOURS = 3
+"""Of the proximity graph (FSGS)."""
+
+
+class Proximity(NamedTuple):
+    """The graph of each Gaussian's three nearest neighbours (Zhu et al., FSGS, 2024)."""
+
+    score: Tensor
+    """(N,) root mean squared distance to them."""
+    nearest: Tensor
+    """(N, 3) int64, which ones they are."""
+
+    @classmethod
+    def of(cls, means: Tensor) -> Proximity:
+        """The graph of centres (N, 3), N >= 4, on their device."""
+        squared, nearest = _neighbours(means, NEIGHBOURS + 1)
+        # Of others at the same place any may come first, and the point itself need not be found.
+        dropped = 2 * (nearest == torch.arange(len(means))[:, None]).int()
+        dropped[:, 0] += 1
+        others = dropped.argsort(dim=1, descending=True, stable=True)[:, 1:]
+        score = squared.gather(1, others).mean(-1).sqrt()
+        return cls(score.to(means), nearest.gather(1, others).to(means.device))
+
+
+def unpooled(rows: dict[str, Tensor], proximity: Proximity, lonely: Tensor) -> dict[str, Tensor]:
+    """New Gaussians halfway between lonely ones and their three nearest neighbours (FSGS).
+
+    Scales and opacity are the neighbour's, the rotation is none and all harmonics are 0, which is grey.
+
+    Args:
+        rows: parameters (N, ...) by name.
+        lonely: (N,) bool.
+
+    Returns:
+        Parameters (3 M, ...) by the same names for M lonely ones, neighbour by neighbour.
+    """
+    ends = proximity.nearest[lonely].reshape(-1)
+    starts = lonely.nonzero()[:, 0].repeat_interleave(NEIGHBOURS)
+    new = {name: value[ends] for name, value in rows.items()}
+    new["means"] = (rows["means"][starts] + new["means"]) / 2
+    new["quaternions"] = torch.zeros_like(new["quaternions"])
+    new["quaternions"][:, 0] = 1
+    new["sh"] = torch.zeros_like(new["sh"])
+    return new
 
 
 def split_children(rows: dict[str, Tensor], generator: Generator) -> dict[str, Tensor]:

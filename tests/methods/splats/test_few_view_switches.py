@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from datamodules.synthetic.scene import SyntheticConfig, make_scene
-from method_configs import corgs_lite, gs_go
+from method_configs import corgs_lite, fsgs_lite, gs_go
 from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
@@ -17,7 +17,9 @@ from visdom_plugin.methods.splats.virtual_views import VirtualViews
 from visdom_plugin.render import Render
 from visdom_plugin.splat.gaussians import Gaussians
 
-METHODS = {spec.name: spec.presets()[f"{spec.name}+vd"] for spec in (gs_go.SPEC, corgs_lite.SPEC)}
+METHODS = {
+    spec.name: spec.presets()[f"{spec.name}+vd"] for spec in (gs_go.SPEC, corgs_lite.SPEC, fsgs_lite.SPEC)
+}
 
 
 @pytest.fixture(scope="module")

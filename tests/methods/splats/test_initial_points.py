@@ -7,10 +7,11 @@ import torch
 
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
-from method_configs import corgs_lite, gs_go
+from method_configs import corgs_lite, fsgs_lite, gs_go
 from visdom_plugin.errors import CheckpointError
 from visdom_plugin.geometry.cameras import look_at_point
 from visdom_plugin.methods.splats.corgs_lite import CorgsLite
+from visdom_plugin.methods.splats.fsgs.method import FsgsLite
 from visdom_plugin.methods.splats.gs_go import GsGo
 from visdom_plugin.methods.splats.initial_points import draw_points
 from visdom_plugin.registry import Preset
@@ -33,13 +34,15 @@ def cloud(views, n=200):
 
 
 @pytest.mark.parametrize(
-    ("kind", "quick"), [(GsGo, gs_go.SPEC.quick), (CorgsLite, corgs_lite.SPEC.quick)], ids=["gs_go", "corgs"]
+    ("kind", "quick"),
+    [(GsGo, gs_go.SPEC.quick), (CorgsLite, corgs_lite.SPEC.quick), (FsgsLite, fsgs_lite.SPEC.quick)],
+    ids=["gs_go", "corgs", "fsgs"],
 )
-def test_without_a_hull_both_methods_start_from_the_scenes_points(kind, quick, scene):
+def test_without_a_hull_all_methods_start_from_the_scenes_points(kind, quick, scene):
     xyz, rgb = cloud(scene.train)
     method = kind(replace(quick, hull=None))
     method.setup(replace(scene.train, points=(xyz, rgb)), [], hull=None, device=CPU, seed=0)
-    splats = method.splats if kind is GsGo else method.sets[0]
+    splats = method.splats
     torch.testing.assert_close(splats.means, xyz.float())
     dc = splats.optimiser.parameters["sh"].detach()[:, 0]
     torch.testing.assert_close(dc * 0.28209479177387814 + 0.5, rgb)

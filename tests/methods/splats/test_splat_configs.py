@@ -10,6 +10,7 @@ from method_configs import corgs_lite, gs_go
 from visdom_plugin.cli import options
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.methods.splats.configs import CorgsConfig, GsGoConfig
+from visdom_plugin.methods.splats.fsgs.config import FsgsConfig
 from visdom_plugin.splat.set_config import GaussianSetConfig
 
 SHARED = {
@@ -57,6 +58,22 @@ OWN = {
         "co_prune_extents": 0.0,
         "co_prune_world": 0.0,
     },
+    FsgsConfig: {
+        "opacity_reset_from": -1,
+        "opacity_reset_every": -1,
+        "unpool_until": -1,
+        "unpool_distance": 0.0,
+        "unpool_scale": -1.0,
+        "unpool_split_distance": 0.0,
+        "depth_weight": -1.0,
+        "depth_weight_late": -1.0,
+        "depth_until": -1,
+        "pseudo_from": -1,
+        "pseudo_until": -1,
+        "pseudo_every": -1,
+        "pseudo_weight": -1.0,
+        "pseudo_ramp": -1,
+    },
 }
 WRONG = [
     (kind, name, value) for kind, own in OWN.items() for name, value in (SHARED | BOTH | own).items()
@@ -90,6 +107,7 @@ def test_what_is_switched_off_is_in_range():
         ["method:corgs", "--method.co-prune-extents", "-1"],
         ["method:corgs-lite+vd", "--method.ssim-weight", "2"],
         ["method:3dgs-go", "--method.densify-every", "0"],
+        ["method:fsgs", "--method.depth-network", "my_depth"],
     ],
 )
 def test_the_command_line_refuses_it_too(words):
@@ -101,7 +119,7 @@ def test_the_command_line_refuses_it_too(words):
 
 def test_settings_load_without_torch():
     code = (
-        "import sys, method_configs.corgs_lite, method_configs.gs_go\n"
+        "import sys, method_configs.corgs_lite, method_configs.gs_go, method_configs.fsgs_lite\n"
         "print([m for m in ('torch', 'numba', 'cv2', 'scipy') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

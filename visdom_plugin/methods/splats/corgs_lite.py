@@ -15,14 +15,13 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin import seeding
-from visdom_plugin.geometry.camera_paths import draw_between
-from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.losses import photometric_loss
 from visdom_plugin.methods.splats.common import draw_background, drop_some, fit_view
 from visdom_plugin.methods.splats.configs import CorgsConfig
 from visdom_plugin.methods.splats.initial_points import draw_box, draw_points
-from visdom_plugin.methods.splats.pseudo_views import draw_on_ellipse, fit_ellipse
+from visdom_plugin.methods.splats.pseudo_views import PseudoViews
 from visdom_plugin.methods.splats.splat_method import SplatMethod
 from visdom_plugin.methods.splats.strategy import Schedule, Strategy, every
 from visdom_plugin.render import Render
@@ -40,8 +39,7 @@ class CorgsLite(SplatMethod[CorgsConfig]):
 
     def build(self, views: Views, hull: Hull | None, generator: Generator) -> None:
         c = self.config
-        self.cameras, self.look_at = views.cameras, look_at_point(views.cameras)
-        self.ellipse = fit_ellipse(views.cameras)
+        self.pseudo = PseudoViews(c.pseudo_views, views.cameras)
         if c.initial_cloud == "random" and not self.hooks:
             xyz, rgb = draw_box(views.cameras, c.initial_points, generator)
         else:
@@ -92,10 +90,7 @@ class CorgsLite(SplatMethod[CorgsConfig]):
 
     def pseudo_camera(self, step: int) -> Cameras:
         """The unseen view of a step, the same for both sets."""
-        draw = seeding.generator(self.seed, "pseudo", step)
-        if self.config.pseudo_views == "ellipse":
-            return draw_on_ellipse(self.ellipse, draw)
-        return draw_between(self.cameras, self.look_at, draw)
+        return self.pseudo.draw(seeding.generator(self.seed, "pseudo", step))
 
     @torch.no_grad()
     def optimise(self, step: int, output: StepOutput) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Generator, Tensor
 
-from visdom_plugin.geometry.camera_paths import look_at_camera
+from visdom_plugin.geometry.camera_paths import draw_between, look_at_camera
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 
 HEIGHT_VARIATION = 0.1
@@ -84,3 +85,21 @@ def fit_ellipse(cameras: Cameras) -> Ellipse:
 def draw_on_ellipse(ellipse: Ellipse, generator: Generator) -> Cameras:
     """A camera at a uniform angle."""
     return ellipse.camera(2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64))
+
+
+class PseudoViews:
+    """The pseudo views of a run, of the training cameras (N,), N >= 2.
+
+    Args:
+        kind: "ellipse" for an ellipse fitted to the cameras, "between" for places between two of them.
+    """
+
+    def __init__(self, kind: Literal["ellipse", "between"], cameras: Cameras):
+        self.kind, self.cameras = kind, cameras
+        self.look_at, self.ellipse = look_at_point(cameras), fit_ellipse(cameras)
+
+    def draw(self, generator: Generator) -> Cameras:
+        """One camera, drawn with a CPU generator."""
+        if self.kind == "ellipse":
+            return draw_on_ellipse(self.ellipse, generator)
+        return draw_between(self.cameras, self.look_at, generator)

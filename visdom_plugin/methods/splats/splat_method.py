@@ -18,7 +18,7 @@ from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.colour_correction import ColourCorrection, CorrectsColours
 from visdom_plugin.methods.splats.common import scene_extent
-from visdom_plugin.methods.splats.configs import CorgsConfig, GsGoConfig
+from visdom_plugin.methods.splats.configs import HullStartConfig
 from visdom_plugin.methods.splats.virtual_views import VirtualViews
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
@@ -28,7 +28,7 @@ from visdom_plugin.splat.model import GaussianSet
 from visdom_plugin.splat.ply import write_gaussians
 from visdom_plugin.splat.rasterise import NEAR
 
-Config = TypeVar("Config", GsGoConfig, CorgsConfig)
+Config = TypeVar("Config", bound=HullStartConfig)
 
 SEEN_MARGIN = 0.5
 """How far outside of a picture, in its sizes, a centre may lie whose Gaussian still shows at its edge."""

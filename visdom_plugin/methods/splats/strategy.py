@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.render import Render
-from visdom_plugin.splat.densify import split_children, stray_gaussians
+from visdom_plugin.splat.densify import Proximity, split_children, stray_gaussians, unpooled
 from visdom_plugin.splat.model import GaussianSet
 
 log = logging.getLogger(__name__)
@@ -38,6 +38,19 @@ class LargestGaussian(NamedTuple):
     """The same in pixels; wins over the fraction."""
 
 
+class Unpooling(NamedTuple):
+    """Where Gaussians are added because they are far apart (FSGS). All lengths are in extents."""
+
+    until: int
+    """No step from this one on unpools."""
+    distance: float
+    """Root mean squared distance to the three nearest neighbours beyond which a Gaussian grows new ones."""
+    scale: float
+    """Largest standard deviation that it must exceed, too."""
+    split_distance: float
+    """Such distance beyond which it splits, too, at every densification."""
+
+
 @dataclass(frozen=True)
 class Schedule:
     """The steps, counted from 1, after which a set changes besides being densified as its config says."""
@@ -52,6 +65,8 @@ class Schedule:
     """After this step densification removes large Gaussians, too; None for never."""
     largest: LargestGaussian | None = None
     """How large one may be that stays then."""
+    unpooling: Unpooling | None = None
+    """Densification by proximity; None for none."""
 
 
 class Strategy:
@@ -152,10 +167,17 @@ class Strategy:
         grow = self._gradient / self._count.clamp_min(1) >= c.densify_gradient
         if len(splats) >= c.max_gaussians:
             grow = torch.zeros_like(grow)
-        large = p["log_scales"].exp().amax(-1) > c.densify_scale * splats.extent
+        largest_scale = p["log_scales"].exp().amax(-1)
+        large = largest_scale > c.densify_scale * splats.extent
         clone, split = grow & ~large, grow & large
+        unpooling = self.schedule.unpooling if FEWEST <= len(splats) < c.max_gaussians else None
+        if unpooling is not None:
+            far = Proximity.of(p["means"]).score > unpooling.split_distance * splats.extent
+            split = split | (far & (largest_scale > unpooling.scale * splats.extent))
         children = split_children({k: v[split] for k, v in p.items()}, self.split_generator(done))
         splats.optimiser.append({k: torch.cat([v[clone], children[k]]) for k, v in p.items()})
+        if unpooling is not None and done < unpooling.until:
+            self._unpool(unpooling, split)
         new = len(splats) - len(split)
         p = {name: value.detach() for name, value in splats.optimiser.parameters.items()}
         gone = torch.cat([split, split.new_zeros(new)]) | (p["opacity_logits"].sigmoid() < c.prune_opacity)
@@ -173,6 +195,19 @@ class Strategy:
             )
             splats.optimiser.keep(~gone)
         self._gradient = self._count = self._radius = torch.zeros(len(splats), device=splats.device)
+
+    def _unpool(self, unpooling: Unpooling, split: Tensor) -> None:
+        """Adds Gaussians between those that are far apart; the first ones, where `split` is True, are on their way
+        out."""
+        splats = self.splats
+        kept = torch.cat([~split, split.new_ones(len(splats) - len(split))])
+        p = {name: value.detach()[kept] for name, value in splats.optimiser.parameters.items()}
+        if len(p["means"]) < FEWEST:
+            return
+        proximity = Proximity.of(p["means"])
+        lonely = proximity.score > unpooling.distance * splats.extent
+        lonely &= p["log_scales"].exp().amax(-1) > unpooling.scale * splats.extent
+        splats.optimiser.append(unpooled(p, proximity, lonely))
 
     def _warn_of_loss(self, done: int) -> None:
         """Says once when most Gaussians are gone, and why."""
