@@ -82,7 +82,7 @@ class GaussianSet:
     def in_scene(self) -> Gaussians:
         """The current Gaussians in the cameras' frame, outside the graph."""
         own = self.gaussians().detach()
-        return replace(own, means=self.means, log_scales=own.log_scales + math.log(self.unit))
+        return replace(own, means=own.means * self.unit, log_scales=own.log_scales + math.log(self.unit))
 
     def draw(
         self,

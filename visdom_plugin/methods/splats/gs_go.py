@@ -6,18 +6,14 @@ repair. Hooks, where there are any, give the initial points and add their losses
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from torch import Generator, Tensor
 
-from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.losses import disparity_loss
 from visdom_plugin.methods.splats.configs import GsGoConfig
 from visdom_plugin.methods.splats.initial_points import draw_points
-from visdom_plugin.methods.splats.one_set import OneSetMethod
+from visdom_plugin.methods.splats.one_set import Drawn, OneSetMethod
 from visdom_plugin.methods.splats.strategy import LargestGaussian, Schedule, every
-from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.training.protocols import ViewBatch
 
@@ -39,12 +35,10 @@ class GsGo(OneSetMethod[GsGoConfig]):
             )
         )
 
-    def own_losses(
-        self, batch: ViewBatch, render: Render, show: Callable[[Cameras], Render], step: int
-    ) -> dict[str, Tensor]:
+    def own_losses(self, batch: ViewBatch, drawn: Drawn, step: int) -> dict[str, Tensor]:
         c = self.config
         if not c.depth_weight or batch.mono_depth is None or not batch.mask_known:
             return {}
         object_mask = batch.mask if batch.weight is None else batch.mask * batch.weight
-        depth = disparity_loss(render.depth, render.alpha, batch.mono_depth, object_mask)
+        depth = disparity_loss(drawn.render.depth, drawn.render.alpha, batch.mono_depth, object_mask)
         return {} if depth is None else {"depth": c.depth_weight * depth}

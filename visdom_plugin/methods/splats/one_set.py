@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,7 +15,19 @@ from visdom_plugin.methods.splats.common import draw_background, drop_some, fit_
 from visdom_plugin.methods.splats.splat_method import Config, SplatMethod
 from visdom_plugin.methods.splats.strategy import Schedule, Strategy
 from visdom_plugin.render import Render
+from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.training.protocols import StepOutput, ViewBatch
+
+
+class Drawn(NamedTuple):
+    """What a step draws."""
+
+    render: Render
+    """The training view."""
+    gaussians: Gaussians
+    """The step's Gaussians, in the set's own unit, attached to the graph."""
+    show: Callable[[Cameras], Render]
+    """Draws them from another camera, on the same background."""
 
 
 class OneSetMethod(SplatMethod[Config]):
@@ -27,15 +40,8 @@ class OneSetMethod(SplatMethod[Config]):
         """Has the Gaussians, which `build` made, change their number by a schedule."""
         self.strategy = Strategy(self.splats, schedule, partial(seeding.generator, self.seed, "split"))
 
-    def own_losses(
-        self, batch: ViewBatch, render: Render, show: Callable[[Cameras], Render], step: int
-    ) -> dict[str, Tensor]:
-        """What a method adds to the losses that all share: weighted scalars by name.
-
-        Args:
-            render: the training view.
-            show: draws the step's Gaussians from another camera, on the same background.
-        """
+    def own_losses(self, batch: ViewBatch, drawn: Drawn, step: int) -> dict[str, Tensor]:
+        """What a method adds to the losses that all share: weighted scalars by name."""
         return {}
 
     def train_step(self, batch: ViewBatch, step: int) -> StepOutput:
@@ -49,7 +55,7 @@ class OneSetMethod(SplatMethod[Config]):
 
         render = show(batch.camera)
         losses, psnr = fit_view(render, batch, background, c, self.correction)
-        losses |= self.own_losses(batch, render, show, step)
+        losses |= self.own_losses(batch, Drawn(render, gaussians, show), step)
         if self.virtual is not None:
             draw = seeding.generator(self.seed, "virtual", step)
             losses["virtual"] = c.virtual_weight * self.virtual.loss(show, background, draw)

@@ -179,13 +179,13 @@ class Strategy:
         if unpooling is not None and done < unpooling.until:
             self._unpool(unpooling, split)
         new = len(splats) - len(split)
-        p = {name: value.detach() for name, value in splats.optimiser.parameters.items()}
-        gone = torch.cat([split, split.new_zeros(new)]) | (p["opacity_logits"].sigmoid() < c.prune_opacity)
+        shown = splats.gaussians().detach()
+        gone = torch.cat([split, split.new_zeros(new)]) | (shown.opacity_logits.sigmoid() < c.prune_opacity)
         start, largest = self.schedule.prune_large_from, self.schedule.largest
         faint = int(gone.sum()) - len(children["means"]) // 2
         if start is not None and largest is not None and done > start:
             on_screen = torch.cat([self._radius, self._radius.new_zeros(new)])
-            in_space = p["log_scales"].exp().amax(-1)
+            in_space = shown.log_scales.exp().amax(-1)
             gone |= on_screen > (largest.radius if largest.radius_px is None else largest.radius_px)
             gone |= in_space > largest.scale * splats.extent
         if not bool(gone.all()):

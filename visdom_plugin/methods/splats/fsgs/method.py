@@ -7,18 +7,15 @@ the initial points and add their losses.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Generator, Tensor
 
 from visdom_plugin import seeding
-from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.splats.fsgs.config import FsgsConfig
 from visdom_plugin.methods.splats.fsgs.depth import OPAQUE, DepthProvider, of_disparity, pearson
 from visdom_plugin.methods.splats.initial_points import draw_points
-from visdom_plugin.methods.splats.one_set import OneSetMethod
+from visdom_plugin.methods.splats.one_set import Drawn, OneSetMethod
 from visdom_plugin.methods.splats.pseudo_views import PseudoViews
 from visdom_plugin.methods.splats.strategy import Schedule, Unpooling, every
 from visdom_plugin.render import Render
@@ -41,22 +38,19 @@ class FsgsLite(OneSetMethod[FsgsConfig]):
         self.pseudo = PseudoViews(c.pseudo_views, views.cameras)
         self.depth = DepthProvider(views, c.depth_network, self.device)
 
-    def own_losses(
-        self, batch: ViewBatch, render: Render, show: Callable[[Cameras], Render], step: int
-    ) -> dict[str, Tensor]:
+    def own_losses(self, batch: ViewBatch, drawn: Drawn, step: int) -> dict[str, Tensor]:
         c, done, losses = self.config, step + 1, {}
         weight = c.depth_weight if done <= c.depth_until else c.depth_weight_late
         if self.depth.training and weight:
-            losses["depth"] = weight * self._training_depth(batch, render)
+            losses["depth"] = weight * self._training_depth(batch, drawn.render)
         due = c.pseudo_every and c.pseudo_from <= done <= c.pseudo_until and done % c.pseudo_every == 0
         ramp = min((done - c.pseudo_from) / max(c.pseudo_ramp, 1), 1.0)
         if self.depth.network is not None and due and ramp * c.pseudo_weight:
-            drawn = show(self.pseudo.draw(seeding.generator(self.seed, "pseudo", step)))
-            seen = of_disparity(self.depth.predict(drawn.rgb)).forms[0]
-            opaque = (drawn.alpha.detach() > OPAQUE).float()
-            losses["pseudo_depth"] = (
-                ramp * c.pseudo_weight * (1 - pearson(seen, drawn.depth / self.unit, opaque))
-            )
+            view = drawn.show(self.pseudo.draw(seeding.generator(self.seed, "pseudo", step)))
+            seen = of_disparity(self.depth.predict(view.rgb)).forms[0]
+            opaque = (view.alpha.detach() > OPAQUE).float()
+            unlike = 1 - pearson(seen, view.depth / self.unit, opaque)
+            losses["pseudo_depth"] = ramp * c.pseudo_weight * unlike
         return losses
 
     def _training_depth(self, batch: ViewBatch, render: Render) -> Tensor:
