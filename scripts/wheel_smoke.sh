@@ -93,7 +93,7 @@ for command in "$bin"/visdom-*; do
   grep -q "usage: $(basename "$command")" help.txt || { echo "$(basename "$command") --help says:"; cat help.txt; exit 1; }
 done
 "$bin/visdom-methods" > methods.txt
-for method in ingp+vd zipnerf-lite+vd 3dgs-go+vd corgs-lite+vd; do
+for method in ingp+vd zipnerf-lite+vd zerorf-lite+vd 3dgs-go+vd corgs-lite+vd; do
   grep -qF "method:$method " methods.txt || { echo "visdom-methods does not list $method:"; cat methods.txt; exit 1; }
 done
 "$bin/visdom-hull" --views 4 --downscale 4 --resolution 48 --out hull.ply --json > hull.json

@@ -12,7 +12,16 @@ import numpy as np
 import torch
 from my_method.field import Field as WholeField
 
-from method_configs import corgs_lite, fsgs_lite, gs_go, ingp, visdom_field, visdom_gs, zipnerf_lite
+from method_configs import (
+    corgs_lite,
+    fsgs_lite,
+    gs_go,
+    ingp,
+    visdom_field,
+    visdom_gs,
+    zerorf_lite,
+    zipnerf_lite,
+)
 from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
 from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.domain import VisibleDomain
@@ -376,6 +385,19 @@ def _methods() -> list[MethodSpec | Preset]:
         fine_grid=replace(grid, levels=3, features=1),
         grid=replace(grid, features=4),
     )
+    found += _field_presets(
+        "SmallZeroRf",
+        "visdom_plugin.methods.fields.zerorf_lite:ZeroRfLite",
+        zerorf_lite,
+        steps=40,
+        first_rays=128,
+        rays=256,
+        step_length=0.06,
+        missing_step_length=0.3,
+        noise_resolution=2,
+        width=4,
+        occupancy_resolution=32,
+    )
     return found
 
 
@@ -389,5 +411,6 @@ WHOLE = (
     "SmallIngp",
     "SmallVisdomField",
     "SmallZipNerf",
+    "SmallZeroRf",
 )
 """Those that break nothing: the example and the built-in methods, small."""

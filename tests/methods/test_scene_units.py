@@ -15,7 +15,16 @@ from visdom_plugin.training.evaluate import carve_reference, evaluate
 from visdom_plugin.training.run import build, choose_batches
 
 CPU = torch.device("cpu")
-VARIANTS = ("ingp+vd", "zipnerf-lite+vd", "3dgs-go+vd", "corgs-lite+vd", "3dgs-go", "fsgs-lite+vd")
+VARIANTS = (
+    "ingp+vd",
+    "zipnerf-lite+vd",
+    "zerorf-lite+vd",
+    "zerorf-lite",
+    "3dgs-go+vd",
+    "corgs-lite+vd",
+    "3dgs-go",
+    "fsgs-lite+vd",
+)
 EXACT = (2.0**-20, 2.0**12)
 """Powers of two change no mantissa: every number must stay as it is, to the last bit."""
 OTHER = (0.002, 1e3)
@@ -47,6 +56,8 @@ def numbers(name: str, scene):
         "initial_points": 400,
         "max_rays": 256,
         "rays": 128,
+        "first_rays": 64,
+        "noise_resolution": 2,
         "samples_per_step": 1 << 11,
         "density_bias": 0.0,
         "densify_from": 2,

@@ -8,10 +8,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
-from method_configs import corgs_lite, fsgs_lite, gs_go, ingp, zipnerf_lite
+from method_configs import corgs_lite, fsgs_lite, gs_go, ingp, zerorf_lite, zipnerf_lite
 from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.fields.ingp import Ingp
+from visdom_plugin.methods.fields.zerorf_lite import ZeroRfLite
 from visdom_plugin.methods.fields.zipnerf_lite import ZipNerfLite
 from visdom_plugin.methods.splats.corgs_lite import CorgsLite
 from visdom_plugin.methods.splats.fsgs.method import FsgsLite
@@ -30,6 +31,7 @@ METHODS = SPLATS | {
     Ingp: replace(
         ingp.SPEC.quick, steps=40, max_rays=128, samples_per_step=1 << 10, grid=replace(GRID, features=2)
     ),
+    ZeroRfLite: replace(zerorf_lite.SPEC.quick, steps=40, first_rays=64, noise_resolution=2, width=4),
     ZipNerfLite: replace(
         zipnerf_lite.SPEC.quick,
         steps=40,

@@ -19,7 +19,7 @@ from visdom_plugin.training.run import build, choose_batches, export
 
 CPU = torch.device("cpu")
 FAR = pytest.mark.parametrize("far", [1e5, 5e6])
-VARIANTS = ("ingp+vd", "zipnerf-lite+vd", "3dgs-go+vd", "corgs-lite+vd")
+VARIANTS = ("ingp+vd", "zipnerf-lite+vd", "zerorf-lite+vd", "3dgs-go+vd", "corgs-lite+vd")
 STEPS = 6
 
 
@@ -49,6 +49,8 @@ def begin(name: str, scene):
         "initial_points": 400,
         "max_rays": 256,
         "rays": 128,
+        "first_rays": 64,
+        "noise_resolution": 2,
         "samples_per_step": 1 << 11,
         "density_bias": 0.0,
     }

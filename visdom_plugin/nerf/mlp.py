@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import TypeAlias
 
 import torch
 from torch import Generator, Tensor, nn
@@ -31,6 +32,17 @@ class TruncatedExp(torch.autograd.Function):
 truncated_exp = TruncatedExp.apply
 
 
+Layer: TypeAlias = nn.Linear | nn.Conv1d | nn.Conv2d | nn.Conv3d
+
+
+@torch.no_grad()
+def draw_weights(layer: Layer, most: float, generator: Generator) -> None:
+    """Makes a layer's weights uniform within +-most, drawn on the CPU, and its biases zero."""
+    layer.weight.copy_((2 * torch.rand(layer.weight.shape, generator=generator) - 1) * most)
+    if layer.bias is not None:
+        layer.bias.zero_()
+
+
 def perceptron(sizes: Sequence[int], generator: Generator, *, bias: bool = False) -> nn.Sequential:
     """Linear layers with ReLU between them, weights uniform within +-sqrt(6 / inputs) (He et al. 2015).
 
@@ -45,11 +57,6 @@ def perceptron(sizes: Sequence[int], generator: Generator, *, bias: bool = False
     for i, (n, m) in enumerate(pairwise(sizes)):
         last = i + 2 == len(sizes)
         layer = nn.Linear(n, m, bias=bias)
-        with torch.no_grad():
-            layer.weight.copy_(
-                (2 * torch.rand(m, n, generator=generator) - 1) * math.sqrt((3 if last else 6) / n)
-            )
-            if bias:
-                layer.bias.zero_()
+        draw_weights(layer, math.sqrt((3 if last else 6) / n), generator)
         layers += [layer] if last else [layer, nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)

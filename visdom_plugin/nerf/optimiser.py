@@ -14,6 +14,8 @@ class FieldOptimiser:
     Args:
         groups: pairs of named parameters and weight decay.
         betas, eps: Adam's.
+        decoupled: whether weights decay beside the moments (AdamW), not by the gradient.
+        clip: largest norm of all gradients together, to which longer ones are shortened; None for any.
     """
 
     def __init__(
@@ -22,9 +24,13 @@ class FieldOptimiser:
         *,
         betas: tuple[float, float],
         eps: float,
+        decoupled: bool = False,
+        clip: float | None = None,
     ):
+        self.clip = clip
         self.parameters = {name: p for named, _ in groups for name, p in named.items()}
-        self.adam = torch.optim.Adam(
+        kind = torch.optim.AdamW if decoupled else torch.optim.Adam
+        self.adam = kind(
             [{"params": list(named.values()), "weight_decay": decay} for named, decay in groups],
             lr=0.0,
             betas=betas,
@@ -36,6 +42,8 @@ class FieldOptimiser:
         """One step; gradients are dropped afterwards."""
         for group in self.adam.param_groups:
             group["lr"] = learning_rate
+        if self.clip is not None:
+            nn.utils.clip_grad_norm_(self.parameters.values(), self.clip)
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
 

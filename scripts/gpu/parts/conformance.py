@@ -1,4 +1,4 @@
-"""`pytest --pyargs visdom_plugin.conformance` on the device: a method's promises, for each of the four."""
+"""`pytest --pyargs visdom_plugin.conformance` on the device: a method's promises, for each of those compared."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from parts.tests import run_pytest
 def cases(bench: Bench) -> list[Case]:
     found = []
     for name in subjects.METHODS:
-        needs = () if name.startswith(("ingp", "zipnerf")) else ("gsplat",)
+        needs = () if name.startswith(("ingp", "zipnerf", "zerorf")) else ("gsplat",)
         found.append(Case(name, _conform(name), 90, needs))
     return bench.choose(found)
 

@@ -35,7 +35,7 @@ def cases(bench: Bench) -> list[Case]:
     for count, size in ((300, 61), (bench.size(20_000, 500), bench.size(200, 40))):
         found.append(Case(f"rasteriser, {count}", _raster_case(count, size), 60, ("gsplat",)))
     for name in subjects.METHODS:
-        needs = () if name in ("ingp", "zipnerf-lite") else ("gsplat",)
+        needs = () if name in ("ingp", "zipnerf-lite", "zerorf-lite") else ("gsplat",)
         found.append(Case(f"first step of {name}+vd", _first_step(f"{name}+vd"), 60, needs))
         found.append(Case(f"{name}+vd after a checkpoint", _resumed(f"{name}+vd"), 60, needs))
     return bench.choose(found)

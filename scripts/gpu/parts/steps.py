@@ -14,7 +14,7 @@ from bench import Bench, Case
 def cases(bench: Bench) -> list[Case]:
     found = []
     for name in subjects.VARIANTS:
-        needs = () if name.startswith(("ingp", "zipnerf")) else ("gsplat",)
+        needs = () if name.startswith(("ingp", "zipnerf", "zerorf")) else ("gsplat",)
         found.append(Case(name, _steps(name), 60, needs))
     found.append(Case("gsplat's own step, 20000", gsplat_step, 40, ("gsplat",), only_cuda=True))
     found.append(Case("nerfacc's own sampling and rendering", nerfacc_step, 40, ("nerfacc",), only_cuda=True))

@@ -17,7 +17,7 @@ ALLOWED_DB = 0.5
 def cases(bench: Bench) -> list[Case]:
     found = []
     for name in subjects.VARIANTS:
-        needs = () if name.startswith(("ingp", "zipnerf")) else ("gsplat",)
+        needs = () if name.startswith(("ingp", "zipnerf", "zerorf")) else ("gsplat",)
         found.append(Case(name, _train(name), 60 if bench.on_cuda else 600, needs))
     return bench.choose(found)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from datamodules.synthetic.scene import SyntheticConfig, make_scene
-from method_configs import ingp, zipnerf_lite
+from method_configs import ingp, zerorf_lite, zipnerf_lite
 from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
@@ -18,7 +18,9 @@ from visdom_plugin.methods.fields.shape_prior import MARGIN, ShapePrior
 from visdom_plugin.nerf.frame import Frame
 from visdom_plugin.training.run import build
 
-METHODS = {spec.name: spec.presets()[f"{spec.name}+vd"] for spec in (ingp.SPEC, zipnerf_lite.SPEC)}
+METHODS = {
+    spec.name: spec.presets()[f"{spec.name}+vd"] for spec in (ingp.SPEC, zerorf_lite.SPEC, zipnerf_lite.SPEC)
+}
 FRAME = Frame(torch.tensor([3.0, -1, 2], dtype=torch.float64), 0.25)
 
 

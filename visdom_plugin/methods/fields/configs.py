@@ -213,3 +213,113 @@ class ZipNerfConfig(FieldConfig):
                 "view_degree": (self.view_degree >= 0, "0 or more"),
             },
         )
+
+
+@dataclass(frozen=True)
+class ZeroRfConfig(FieldConfig):
+    """ZeroRF (Shi et al. 2023). Lengths are in half sides of the cube [-1, 1]^3 that is fitted to the object.
+
+    Defaults are the published ones, except for the marching step, which there grows with the distance.
+    """
+
+    steps: int = 10_000
+    """Optimisation steps, one batch of pixels each."""
+    first_rays: int = 1 << 12
+    """Pixels per step before the first of `rays_grow_at`; then the geometric mean of this and `rays`."""
+    rays: int = 1 << 16
+    """Pixels per step from the second of `rays_grow_at` on."""
+    rays_grow_at: tuple[int, int] = (50, 100)
+    background: Literal["white", "random"] = "white"
+    """Behind the photograph in training. Random colours need the masks as alpha: a silhouette signal."""
+    compare_alpha: bool = True
+    """Let the mean squared error compare opacity with the mask as a fourth channel, as the original does where
+    photographs come with alpha. False compares colours alone."""
+    mse_weight: float = 3.2
+
+    fit_margin: float = 0.1
+    """Room around the object in the cube, as a share of its half side."""
+    near: float = 0.2
+    step_length: float = 0.0034
+    """Between two samples of a ray, where the occupancy grid leaves any."""
+    missing_step_length: float = 0.027
+    """The same for rays that miss the hull, with the visible-domain hook: they only clear space."""
+    cull_weight: float = 1e-4
+    """Training samples that weigh less than this in their pixel are left out."""
+
+    representation: Literal["tensorf", "dif"] = "tensorf"
+    """tensorf: three planes, each times the line across it. dif: two volumes, one of which repeats."""
+    dif_period: float = 0.4
+    """After which the second volume of "dif" repeats; the original calls it a frequency."""
+    noise_channels: int = 8
+    noise_resolution: int = 20
+    """Along each side of the frozen noise: about a fortieth of the photographs' pixels. Planes and lines are 16
+    times as fine, volumes 8 times."""
+    channels: int = 16
+    """Features of each plane, line or volume."""
+    width: int = 32
+    """Channels of the generating networks' finest level; coarser ones have up to eight times as many."""
+    hidden: int = 64
+    """Width of the one hidden layer between features and density or colour."""
+    view_degree: int = 3
+    """Spherical harmonics of the viewing direction that colours may depend on: degree^2 numbers, 0 none."""
+    density_bias: float = 0.0
+    """density = exp(x + bias), per half side."""
+
+    occupancy_resolution: int = 64
+    occupancy_every: int = 1
+    """Steps between two updates of the occupancy grid."""
+    occupancy_warm_up: int = 0
+    """Until this step, updates look at all cells; later at `occupancy_fraction`, and at as many occupied ones."""
+    occupancy_fraction: float = 1.0
+    occupancy_density: float = 0.05
+    """Cells with less density than this, and than the mean, are skipped in training."""
+    test_occupancy_density: float = 0.01
+    """The same when rendering."""
+    drop_unsampled: bool = False
+    """Cells that no training ray samples, given its bounds, stay empty for ever."""
+
+    lr: float = 0.002
+    betas: tuple[float, float] = (0.9, 0.98)
+    weight_decay: float = 0.2
+    gradient_clip: float = 1.0
+    """Largest norm of all gradients together."""
+
+    half_side: ClassVar[float] = 1.0
+    drops_samples: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive = ("step_length", "missing_step_length", "dif_period", "lr", "gradient_clip", "mse_weight")
+        counts = (
+            "first_rays",
+            "rays",
+            "noise_channels",
+            "noise_resolution",
+            "channels",
+            "width",
+            "hidden",
+            "occupancy_resolution",
+            "occupancy_every",
+        )
+        least_0 = (
+            "steps",
+            "near",
+            "fit_margin",
+            "weight_decay",
+            "occupancy_density",
+            "test_occupancy_density",
+        )
+        first, second = self.rays_grow_at
+        demand(
+            self,
+            {name: (getattr(self, name) > 0, "a positive number") for name in positive}
+            | {name: (getattr(self, name) >= 1, "1 or more") for name in counts}
+            | {name: (getattr(self, name) >= 0, "0 or more") for name in least_0}
+            | {
+                "rays_grow_at": (0 <= first <= second, "two steps, the second not before the first"),
+                "cull_weight": (0 <= self.cull_weight < 1, "a share from 0 to below 1"),
+                "view_degree": (0 <= self.view_degree <= 4, "0 to 4"),
+                "occupancy_fraction": (0 < self.occupancy_fraction <= 1, "a share above 0, at most 1"),
+                "betas": (all(0 <= b < 1 for b in self.betas), "two numbers from 0 to below 1"),
+            },
+        )

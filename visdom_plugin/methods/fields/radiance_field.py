@@ -15,16 +15,16 @@ from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook, empty_space
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.colour_correction import ColourCorrection, CorrectsColours
 from visdom_plugin.methods.fields.common import LocalRays, bound_rays, render_image, spread_rays
-from visdom_plugin.methods.fields.configs import IngpConfig, ZipNerfConfig
+from visdom_plugin.methods.fields.configs import IngpConfig, ZeroRfConfig, ZipNerfConfig
 from visdom_plugin.methods.fields.shape_prior import ShapePrior
-from visdom_plugin.nerf.frame import frame_of
+from visdom_plugin.nerf.frame import Frame, frame_of
 from visdom_plugin.nerf.optimiser import FieldOptimiser
 from visdom_plugin.render import Render
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import draw_on, generator, uniform
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
-Config = TypeVar("Config", IngpConfig, ZipNerfConfig)
+Config = TypeVar("Config", IngpConfig, ZeroRfConfig, ZipNerfConfig)
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ class RadianceField(CorrectsColours, ABC, Generic[Config]):
         seed: int,
     ) -> None:
         self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
-        self.frame = frame_of(views.cameras)
+        self.frame = self.choose_frame(views)
         if len(views) <= self.config.few_views and self.config.few_views_share < 1:
             self.total_steps = max(1, round(self.config.few_views_share * self.config.steps))
         cameras = views.cameras.to(device)
@@ -67,6 +67,10 @@ class RadianceField(CorrectsColours, ABC, Generic[Config]):
         self.build(cameras, generator(seed, "field"))
         if device.type == "cpu":
             self._warm_up(views.cameras[0])
+
+    def choose_frame(self, views: Views) -> Frame:
+        """Where the field lives, from the training views."""
+        return frame_of(views.cameras)
 
     @abstractmethod
     def build(self, cameras: Cameras, generator: Generator) -> None:

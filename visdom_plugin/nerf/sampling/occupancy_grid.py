@@ -93,8 +93,12 @@ class OccupancyGrid:
         self.density *= self.decay
         # The same cell may be drawn twice: the larger density counts, whatever the order.
         self.density.scatter_reduce_(0, cells, found, "amax")
-        limit = self.density.double().mean().clamp_max(self.threshold)
-        self.occupied = (self.density > limit).reshape(self.occupied.shape) & self.reachable
+        self.occupied = self.above(self.threshold)
+
+    def above(self, threshold: float) -> Tensor:
+        """(resolution, resolution, resolution) bool, the cells whose remembered density is above a threshold."""
+        limit = self.density.double().mean().clamp_max(threshold)
+        return (self.density > limit).reshape(self.reachable.shape) & self.reachable
 
     def restrict(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> None:
         """Gives up all cells that no training ray samples, but for neighbours of those that one does.
