@@ -1,8 +1,4 @@
-"""Real spherical harmonics to degree 3 with the signs and order of 3DGS (Condon-Shortley phase included).
-
-For kernels of both wings: after a change here delete splat/__pycache__ and nerf/__pycache__, for numba's cache
-looks only at the file of the kernel that calls.
-"""
+"""Real spherical harmonics to degree 3 with the signs and order of 3DGS (Condon-Shortley phase included)."""
 
 from __future__ import annotations
 

@@ -29,10 +29,10 @@ def rasterise_cpu(
     width, height = camera.size
     packed = _pack(camera, near).to(gaussians.means.dtype).numpy()
     parameters = gaussians.tensors().values()
-    means2d, splats, extents, radii = _Project.apply(*parameters, degree, packed, width, height)
+    means2d, splats, radii, tiles = _Project.apply(*parameters, degree, packed, width, height)
     if means2d.requires_grad:
         means2d.retain_grad()
-    rgb, alpha, depth = _Blend.apply(means2d, splats, extents, background, width, height)
+    rgb, alpha, depth = _Blend.apply(means2d, splats, tiles, background, width, height)
     info = {
         "means2d": means2d,
         "radii": radii,
@@ -78,74 +78,84 @@ def _arrays(*tensors: Tensor) -> list[np.ndarray]:
     return [t.detach().contiguous().numpy() for t in tensors]
 
 
+def _or_zeros(gradient: Tensor | None, shape: tuple[int, ...], like: np.ndarray) -> np.ndarray:
+    """A gradient as an array; torch would fill those that are None with all its threads, which then spin."""
+    return np.zeros(shape, like.dtype) if gradient is None else _arrays(gradient)[0]
+
+
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, log_scales, quaternions, opacity_logits, sh, degree, camera, width, height):
         ctx.save_for_backward(means, log_scales, quaternions, sh)
         arrays = _arrays(means, log_scales, quaternions, opacity_logits, sh)
         n, dtype = len(means), arrays[0].dtype
-        means2d, splats, extents = np.empty((n, 2), dtype), np.empty((n, 8), dtype), np.empty((n, 3), dtype)
-        radii = np.empty((n, 2), np.int32)
+        means2d, splats = np.empty((n, 2), dtype), np.empty((n, projection.RECORD), dtype)
+        radii, tiles = np.empty((n, 2), np.int32), np.empty(n, np.int32)
         parallel_for(
             projection.project, n, GAUSSIANS_PER_PIECE, *arrays, degree, camera, width, height,
-            means2d, splats, extents, radii,
+            means2d, splats, radii, tiles,
         )  # fmt: skip
-        ctx.rest = (degree, camera, width, height, splats, extents)
-        out = [torch.from_numpy(x) for x in (means2d, splats, extents, radii)]
+        ctx.rest = (degree, camera, width, height, splats)
+        ctx.set_materialize_grads(False)
+        out = [torch.from_numpy(x) for x in (means2d, splats, radii, tiles)]
         ctx.mark_non_differentiable(*out[2:])
         return tuple(out)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, g_means2d, g_splats, *_):
-        arrays = _arrays(*ctx.saved_tensors)
+        arrays, splats = _arrays(*ctx.saved_tensors), ctx.rest[-1]
         # Written whole by the kernel.
         g_means, g_log_scales, g_quaternions, g_sh = (np.empty_like(x) for x in arrays)
         g_opacity_logits = np.empty(len(g_means), g_means.dtype)
         gradients = (g_means, g_log_scales, g_quaternions, g_opacity_logits, g_sh)
         parallel_for(
             projection.project_backward, len(g_means), GAUSSIANS_PER_PIECE, *arrays, *ctx.rest,
-            *_arrays(g_means2d, g_splats), *gradients,
+            _or_zeros(g_means2d, (len(splats), 2), splats), _or_zeros(g_splats, splats.shape, splats), *gradients,
         )  # fmt: skip
         return *(torch.from_numpy(g) for g in gradients), None, None, None, None
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, splats, extents, background, width, height):
-        arrays = _arrays(means2d, splats, extents, background)
-        tiles = Tiles(*arrays[:3], width, height)
-        dtype, size = arrays[0].dtype, (height, width)
+    def forward(ctx, means2d, splats, counts, background, width, height):
+        # The means are an input for their gradient's sake; `splats` holds them, too.
+        records, counts, colour = _arrays(splats, counts, background)
+        tiles = Tiles(records, counts, width, height)
+        dtype, size = colour.dtype, (height, width)
         rgb = np.empty((*size, 3), dtype)
-        alpha, depth, transmittance = (np.empty(size, dtype) for _ in range(3))
-        last = np.empty(size, np.int32)
+        alpha, depth, transmittance, ends = (np.empty(size, dtype) for _ in range(4))
+        reached = np.empty(tiles.count, np.int32)
         parallel_for(
-            blending.blend, tiles.count, TILES_PER_PIECE, tiles.starts, tiles.gaussians, tiles.columns, *arrays,
-            rgb, alpha, depth, transmittance, last,
+            blending.blend, tiles.count, TILES_PER_PIECE, tiles.starts, tiles.gaussians, tiles.rows, tiles.columns,
+            records, colour, rgb, alpha, depth, transmittance, ends, reached,
         )  # fmt: skip
         out = [torch.from_numpy(x) for x in (rgb, alpha, depth)]
-        ctx.save_for_backward(means2d, splats, extents, background, *out[1:])
-        ctx.tiles, ctx.transmittance, ctx.last = tiles, transmittance, last
+        ctx.save_for_backward(splats, background, *out[1:])
+        ctx.tiles, ctx.rest = tiles, (transmittance, ends, reached)
+        ctx.set_materialize_grads(False)
         return tuple(out)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, g_rgb, g_alpha, g_depth):
-        *inputs, alpha, depth = _arrays(*ctx.saved_tensors)
-        tiles, last = ctx.tiles, ctx.last
-        outer = _arrays(g_rgb, g_alpha, g_depth)
-        drawn_starts = blending.drawn_starts_of(last, tiles.columns, tiles.count)
-        sums = np.empty((drawn_starts[-1], blending.SUMS), alpha.dtype)
+        splats, background, alpha, depth = _arrays(*ctx.saved_tensors)
+        tiles = ctx.tiles
+        shapes = ((*alpha.shape, 3), alpha.shape, alpha.shape)
+        outer = [
+            _or_zeros(g, shape, alpha) for g, shape in zip((g_rgb, g_alpha, g_depth), shapes, strict=True)
+        ]
+        sums = np.empty((len(tiles.slots), blending.SUMS), alpha.dtype)
         parallel_for(
-            blending.blend_backward, tiles.count, TILES_PER_PIECE, tiles.starts, tiles.gaussians, tiles.columns,
-            *inputs, alpha, depth, ctx.transmittance, last, *outer, drawn_starts, sums,
+            blending.blend_backward, tiles.count, TILES_PER_PIECE, tiles.starts, tiles.gaussians, tiles.rows,
+            tiles.slots, tiles.columns, splats, background, alpha, depth, *ctx.rest, *outer, sums,
         )  # fmt: skip
-        g_means2d, g_splats = np.empty_like(inputs[0]), np.empty_like(inputs[1])
+        g_means2d, g_splats = np.empty((len(splats), 2), splats.dtype), np.empty_like(splats)
         parallel_for(
-            blending.gather, len(g_means2d), GAUSSIANS_PER_PIECE, tiles.offsets, tiles.slot_tiles,
-            tiles.slot_places, tiles.starts, drawn_starts, sums, g_means2d, g_splats,
+            blending.gather, len(splats), GAUSSIANS_PER_PIECE, tiles.order, tiles.offsets, splats, sums,
+            g_means2d, g_splats,
         )  # fmt: skip
         g_background = None
         if ctx.needs_input_grad[3]:
-            g_background = torch.from_numpy((outer[0] * ctx.transmittance[..., None]).sum((0, 1)))
+            g_background = torch.from_numpy((outer[0] * ctx.rest[0][..., None]).sum((0, 1)))
         return torch.from_numpy(g_means2d), torch.from_numpy(g_splats), None, g_background, None, None

@@ -3,118 +3,123 @@
 Per pixel and Gaussian: alpha = min(0.999, opacity exp(-sigma)), skipped below 1/255; the first Gaussian that
 would bring the transmittance to 1e-4 or less ends the pixel and is not drawn (gsplat, 3DGS).
 
-The pixels of a tile live in one scratch array of PLANES planes of 256 numbers, so that the loops over pixels
-have constant distances between operands and vectorise.
+A row of a tile is one vector. A row's numbers lie in one scratch array, PLANES vectors a row: what a pixel holds.
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from visdom_plugin.compute.fastmath import exp_negative
+from visdom_plugin.compute import lanes
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.splat.cpu.projection import ALPHA_MIN
+from visdom_plugin.compute.lanes import any_of, exp2, fill, load, maximum, minimum, store, where
+from visdom_plugin.splat.cpu.projection import LOG2_ALPHA_MIN, LOG2_E, RECORD
 from visdom_plugin.splat.cpu.tiles import TILE
+
+assert TILE == lanes.WIDTH == RECORD
 
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
-SUMS = 10
-"""Gradients per intersection: of mean x, y, conic a, b, c, opacity, red, green, blue, z."""
 
-PLANES = 9
-PIXELS = TILE * TILE
-# Unsigned, else every index would be tested for being negative and nothing would vectorise.
-X, Y, T, LAST, RED, GREEN, BLUE, Z, BEHIND = (np.uint64(PIXELS * plane) for plane in range(PLANES))
-CHECK_EVERY = 16
-"""Gaussians between two looks at which rows are still being drawn."""
+SUMS = 16
+"""Numbers per intersection, the last six unused. With g the loss's gradient by sigma at a pixel, and dx, dy from
+the pixel to the mean: sums of g, g dx, g dy, g dx^2, g dx dy, g dy^2, gradients of red, green, blue, z."""
+
+# T is the transmittance, negated once a pixel has ended; END the place in the tile of the Gaussian that ended it.
+# Then, going forward, the colour and depth summed; going backward, their gradients, and the part of the loss that
+# lies behind.
+T, END, RED, GREEN, BLUE, Z, BEHIND, PLANES = (TILE * plane for plane in range(8))
+BATCH = 16
+"""Gaussians that are fetched at once, and after which rows that have ended are looked for."""
+
+
+@kernel(error_model="numpy")
+def _scratch(like, count):
+    """An array of `count` numbers that begins at a cache line: a vector across two takes twice as long."""
+    room = np.empty(count + 16, like.dtype)
+    start = (-room.ctypes.data % 64) // like.itemsize
+    return room[start : start + count]
+
+
+@kernel(error_model="numpy")
+def _fetch(k, count, gaussians, splats, batch):
+    """Copies the records of the next Gaussians next to each other: their cache misses overlap."""
+    for j in range(count):
+        store(batch, j * RECORD, load(splats, np.int64(gaussians[k + j]) * RECORD))
 
 
 @kernel(fast=True)
-def _draw(s, p0, p1, place, u, v, a, b, c, opacity, red, green, blue, z):
-    """Blends one Gaussian into pixels p0 .. p1 - 1. A pixel that is done has its T negated."""
-    real = s.dtype.type
-    half, zero, one = real(0.5), real(0), real(1)
-    for p in range(np.uint64(p0), np.uint64(p1)):
-        dx, dy = u - s[p + X], v - s[p + Y]
-        sigma = half * (a * dx * dx + c * dy * dy) + b * dx * dy
-        alpha = min(real(ALPHA_MAX), opacity * exp_negative(sigma))
-        t = s[p + T]
-        drawn = (sigma >= zero) & (alpha >= real(ALPHA_MIN)) & (t > zero)
-        left = t * (one - alpha)
-        last = drawn & (left <= real(TRANSMITTANCE_MIN))
-        drawn = drawn & (left > real(TRANSMITTANCE_MIN))
-        weight = alpha * t if drawn else zero
-        s[p + T] = left if drawn else (-t if last else t)
-        s[p + LAST] = place if drawn else s[p + LAST]
-        s[p + RED] += weight * red
-        s[p + GREEN] += weight * green
-        s[p + BLUE] += weight * blue
-        s[p + Z] += weight * z
-
-
-@kernel(error_model="numpy")
-def _open_rows(s):
-    """First and one past the last row of the tile that still has a pixel to draw."""
-    first, end = TILE, 0
-    for row in range(TILE):
-        best = s[T + np.uint64(row * TILE)]
-        for p in range(np.uint64(row * TILE), np.uint64((row + 1) * TILE)):
-            best = max(best, s[T + p])
-        if best > 0:
-            first, end = min(first, row), row + 1
-    return first, end
-
-
-@kernel(error_model="numpy")
-def _rows(v, reach, top):
-    """Rows of a tile whose pixel centres lie within `reach` of v: first and one past the last."""
-    first, last = math.ceil(max(v - reach - 0.5 - top, 0)), math.floor(min(v + reach - 0.5 - top, TILE - 1))
-    return first, last + 1
+def _along_row(batch, g, xs, y):
+    """Of the Gaussian at g: dx, dy to the pixels of row y; the rest of log2(alpha) = a_dx - dy (c dy + b_dx)."""
+    real = batch.dtype.type
+    half = real(0.5)
+    dx, dy = batch[g + 8] - xs, fill(batch[g + 9] - (real(y) + half))
+    a, b, c = real(0.5 * LOG2_E) * batch[g], real(LOG2_E) * batch[g + 1], real(0.5 * LOG2_E) * batch[g + 2]
+    return dx, dy, batch[g + 13] - a * dx * dx, b * dx, fill(c)
 
 
 @kernel(error_model="numpy")
 def blend(
-    begin, end, starts, gaussians, columns, means2d, splats, extents, background,
-    rgb, alpha, depth, transmittance, last,
+    begin, end, starts, gaussians, rows, columns, splats, background,
+    rgb, alpha, depth, transmittance, ends, reached,
 ):  # fmt: skip
     """Draws tiles begin .. end - 1.
 
     Writes rgb (H, W, 3) with the background in it, alpha (H, W), depth (H, W) divided by alpha, transmittance
-    (H, W), and last (H, W) int32: the index within its tile of the last Gaussian drawn there, or -1.
+    (H, W), ends (H, W): the place within its tile of the Gaussian that ended a pixel, or infinity, and reached
+    (tiles,): how many of a tile's Gaussians were looked at.
     """
     height, width = alpha.shape
     real = alpha.dtype.type
     zero, one, half = real(0), real(1), real(0.5)
-    s = np.empty(PLANES * PIXELS, alpha.dtype)
+    s, batch = _scratch(alpha, TILE * PLANES), _scratch(alpha, BATCH * RECORD)
+    nothing = fill(zero)
     for tile in range(begin, end):
         top, left = (tile // columns) * TILE, (tile % columns) * TILE
-        s[:] = zero
-        for p in range(PIXELS):
-            y, x = top + p // TILE, left + p % TILE
-            s[p + X], s[p + Y] = real(x) + half, real(y) + half
-            s[p + T] = one if x < width and y < height else -one
-            s[p + LAST] = -one
-        first_row, end_row = _open_rows(s)
-        start = starts[tile]
-        for k in range(start, starts[tile + 1]):
-            if (k - start) % CHECK_EVERY == CHECK_EVERY - 1:
-                first_row, end_row = _open_rows(s)
-                if end_row == 0:
-                    break
-            g = gaussians[k]
-            r0, r1 = _rows(means2d[g, 1], extents[g, 1], top)
-            r0, r1 = max(r0, first_row), min(r1, end_row)
-            if r0 < r1:
-                _draw(
-                    s, r0 * TILE, r1 * TILE, real(k - start), means2d[g, 0], means2d[g, 1],
-                    splats[g, 0], splats[g, 1], splats[g, 2], splats[g, 3],
-                    splats[g, 4], splats[g, 5], splats[g, 6], splats[g, 7],
-                )  # fmt: skip
+        xs = lanes.count_up(real(left) + half)
+        for p in range(0, TILE * PLANES, PLANES):
+            store(s, p + T, where(xs < real(width if top + p // PLANES < height else 0), one, -one))
+            store(s, p + END, fill(real(np.inf)))
+            for plane in range(RED, BEHIND, TILE):
+                store(s, p + plane, nothing)
+        start, finish = starts[tile], starts[tile + 1]
+        k = start
+        while k < finish:
+            first_row, end_row = TILE, 0
+            for row in range(TILE):
+                if any_of(load(s, row * PLANES + T) > zero):
+                    first_row, end_row = min(first_row, row), row + 1
+            if end_row == 0:
+                break
+            count = min(BATCH, finish - k)
+            _fetch(k, count, gaussians, splats, batch)
+            for j in range(count):
+                r0, r1 = max(rows[k + j] // 32, first_row), min(rows[k + j] % 32, end_row)
+                g = j * RECORD
+                _, dy, a_dx, b_dx, c = _along_row(batch, g, xs, top + r0)
+                red, green, blue, z = batch[g + 4], batch[g + 5], batch[g + 6], batch[g + 7]
+                place = real(k + j - start)
+                for p in range(r0 * PLANES, r1 * PLANES, PLANES):
+                    power = a_dx - dy * (c * dy + b_dx)
+                    dy = dy - one
+                    passes = power >= real(LOG2_ALPHA_MIN)
+                    opacity = minimum(exp2(maximum(power, real(LOG2_ALPHA_MIN))), real(ALPHA_MAX))
+                    t = load(s, p + T)
+                    weight = opacity * t
+                    left_over = t - weight
+                    closes = passes & (left_over <= real(TRANSMITTANCE_MIN)) & (t > zero)
+                    weight = where(passes & (left_over > real(TRANSMITTANCE_MIN)), weight, nothing)
+                    store(s, p + T, where(closes, zero - t, t - weight))
+                    store(s, p + END, where(closes, place, load(s, p + END)))
+                    store(s, p + RED, load(s, p + RED) + weight * red)
+                    store(s, p + GREEN, load(s, p + GREEN) + weight * green)
+                    store(s, p + BLUE, load(s, p + BLUE) + weight * blue)
+                    store(s, p + Z, load(s, p + Z) + weight * z)
+            k += count
+        reached[tile] = k - start
         for y in range(top, min(top + TILE, height)):
             for x in range(left, min(left + TILE, width)):
-                p = (y - top) * TILE + x - left
+                p = (y - top) * PLANES + x - left
                 t = abs(s[p + T])
                 transmittance[y, x] = t
                 alpha[y, x] = one - t
@@ -122,73 +127,40 @@ def blend(
                 rgb[y, x, 1] = s[p + GREEN] + t * background[1]
                 rgb[y, x, 2] = s[p + BLUE] + t * background[2]
                 depth[y, x] = s[p + Z] / (one - t) if t < one else zero
-                last[y, x] = np.int32(s[p + LAST])
-
-
-@kernel(fast=True)
-def _differentiate(s, p0, p1, place, u, v, a, b, c, opacity, red, green, blue, z):
-    """Takes one Gaussian off pixels p0 .. p1 - 1 again; returns its sums of gradients, in moments of the offset.
-
-    T becomes the transmittance in front of it, BEHIND the loss gradient carried by all that lies behind. With q
-    the gradient along this Gaussian's colour and depth, dL/dalpha = T q - BEHIND / (1 - alpha).
-    """
-    real = s.dtype.type
-    half, zero, one = real(0.5), real(0), real(1)
-    s0, sx, sy, sxx, sxy, syy = zero, zero, zero, zero, zero, zero
-    s_red, s_green, s_blue, s_z = zero, zero, zero, zero
-    for p in range(np.uint64(p0), np.uint64(p1)):
-        dx, dy = u - s[p + X], v - s[p + Y]
-        sigma = half * (a * dx * dx + c * dy * dy) + b * dx * dy
-        full = opacity * exp_negative(sigma)
-        alpha = min(real(ALPHA_MAX), full)
-        drawn = (sigma >= zero) & (alpha >= real(ALPHA_MIN)) & (s[p + LAST] >= place)
-        inverse = one / (one - alpha)
-        t = s[p + T] * inverse
-        weight = alpha * t if drawn else zero
-        q = s[p + RED] * red + s[p + GREEN] * green + s[p + BLUE] * blue + s[p + Z] * z
-        behind = s[p + BEHIND]
-        g_sigma = full * (behind * inverse - t * q) if drawn & (full <= real(ALPHA_MAX)) else zero
-        s[p + T] = t if drawn else s[p + T]
-        s[p + BEHIND] = behind + weight * q
-        s_red += weight * s[p + RED]
-        s_green += weight * s[p + GREEN]
-        s_blue += weight * s[p + BLUE]
-        s_z += weight * s[p + Z]
-        s0 += g_sigma
-        sx += g_sigma * dx
-        sy += g_sigma * dy
-        sxx += g_sigma * dx * dx
-        sxy += g_sigma * dx * dy
-        syy += g_sigma * dy * dy
-    return s0, sx, sy, sxx, sxy, syy, s_red, s_green, s_blue, s_z
+                ends[y, x] = s[p + END]
 
 
 @kernel(error_model="numpy")
 def blend_backward(
-    begin, end, starts, gaussians, columns, means2d, splats, extents, background,
-    alpha, depth, transmittance, last, g_rgb, g_alpha, g_depth, drawn_starts, sums,
+    begin, end, starts, gaussians, rows, slots, columns, splats, background,
+    alpha, depth, transmittance, ends, reached, g_rgb, g_alpha, g_depth, sums,
 ):  # fmt: skip
-    """Writes the gradients (SUMS,) of each intersection of tiles begin .. end - 1 that was drawn.
+    """Writes the sums (SUMS,) of each intersection of tiles begin .. end - 1, at its slot.
 
-    Those of tile t are sums[drawn_starts[t] : drawn_starts[t + 1]], front to back.
+    Going back to front, T becomes the transmittance in front of a Gaussian and BEHIND the loss's gradient carried
+    by all that lies behind. With q the gradient along its colour and depth, dL/dalpha is
+    T q - BEHIND / (1 - alpha).
     """
     height, width = alpha.shape
     real = alpha.dtype.type
-    zero, half = real(0), real(0.5)
-    s = np.empty(PLANES * PIXELS, alpha.dtype)
+    zero, one, half = real(0), real(1), real(0.5)
+    s, batch = _scratch(alpha, TILE * PLANES), _scratch(alpha, BATCH * RECORD)
+    nothing = fill(zero)
     for tile in range(begin, end):
-        count = drawn_starts[tile + 1] - drawn_starts[tile]
-        if count == 0:
+        start, finish = starts[tile], starts[tile] + reached[tile]
+        for k in range(finish, starts[tile + 1]):
+            store(sums, np.int64(slots[k]) * SUMS, nothing)
+        if start == finish:
             continue
         top, left = (tile // columns) * TILE, (tile % columns) * TILE
-        s[:] = zero
-        s[LAST : LAST + np.uint64(PIXELS)] = real(-1)
+        xs = lanes.count_up(real(left) + half)
+        for p in range(0, TILE * PLANES, TILE):
+            store(s, p, nothing)
         for y in range(top, min(top + TILE, height)):
             for x in range(left, min(left + TILE, width)):
-                p = (y - top) * TILE + x - left
-                s[p + X], s[p + Y] = real(x) + half, real(y) + half
+                p = (y - top) * PLANES + x - left
                 t, opaque, gz = transmittance[y, x], alpha[y, x], zero
-                s[p + T], s[p + LAST] = t, real(last[y, x])
+                s[p + T], s[p + END] = t, ends[y, x]
                 # depth = z summed / alpha, and alpha = 1 - T; T also carries the background.
                 by_t = -g_alpha[y, x]
                 if opaque > zero:
@@ -198,49 +170,66 @@ def blend_backward(
                     by_t += g_rgb[y, x, channel] * background[channel]
                 s[p + RED], s[p + GREEN], s[p + BLUE] = g_rgb[y, x, 0], g_rgb[y, x, 1], g_rgb[y, x, 2]
                 s[p + Z], s[p + BEHIND] = gz, t * by_t
-        for k in range(count - 1, -1, -1):
-            g = gaussians[starts[tile] + k]
-            r0, r1 = _rows(means2d[g, 1], extents[g, 1], top)
-            out = sums[drawn_starts[tile] + k]
-            if r0 >= r1:
-                out[:] = zero
-                continue
-            a, b, c, opacity = splats[g, 0], splats[g, 1], splats[g, 2], splats[g, 3]
-            s0, sx, sy, sxx, sxy, syy, out[6], out[7], out[8], out[9] = _differentiate(
-                s, r0 * TILE, r1 * TILE, real(k), means2d[g, 0], means2d[g, 1], a, b, c, opacity,
-                splats[g, 4], splats[g, 5], splats[g, 6], splats[g, 7],
-            )  # fmt: skip
-            out[0], out[1] = a * sx + b * sy, b * sx + c * sy
-            out[2], out[3], out[4] = half * sxx, sxy, half * syy
-            out[5] = -s0 / opacity
+        k = finish
+        while k > start:
+            count = min(BATCH, k - start)
+            k -= count
+            _fetch(k, count, gaussians, splats, batch)
+            for j in range(count - 1, -1, -1):
+                r0, r1 = rows[k + j] // 32, rows[k + j] % 32
+                g = j * RECORD
+                dx, dy, a_dx, b_dx, c = _along_row(batch, g, xs, top + r0)
+                red, green, blue, z = batch[g + 4], batch[g + 5], batch[g + 6], batch[g + 7]
+                place = real(k + j - start)
+                s0, sy, syy, s_red, s_green, s_blue, s_z = (
+                    nothing, nothing, nothing, nothing, nothing, nothing, nothing,
+                )  # fmt: skip
+                for p in range(r0 * PLANES, r1 * PLANES, PLANES):
+                    power = a_dx - dy * (c * dy + b_dx)
+                    drawn = (power >= real(LOG2_ALPHA_MIN)) & (load(s, p + END) > place)
+                    full = exp2(maximum(power, real(LOG2_ALPHA_MIN)))
+                    opacity = minimum(full, real(ALPHA_MAX))
+                    inverse = one / (one - opacity)
+                    t, behind = load(s, p + T), load(s, p + BEHIND)
+                    before = t * inverse
+                    weight = where(drawn, opacity * before, nothing)
+                    g_red, g_green, g_blue, g_z = (
+                        load(s, p + RED), load(s, p + GREEN), load(s, p + BLUE), load(s, p + Z),
+                    )  # fmt: skip
+                    q = g_red * red + g_green * green + g_blue * blue + g_z * z
+                    g_sigma = where(
+                        drawn & (full <= real(ALPHA_MAX)), full * (behind * inverse - before * q), nothing
+                    )
+                    store(s, p + T, where(drawn, before, t))
+                    store(s, p + BEHIND, behind + weight * q)
+                    s_red, s_green = s_red + weight * g_red, s_green + weight * g_green
+                    s_blue, s_z = s_blue + weight * g_blue, s_z + weight * g_z
+                    by_y = g_sigma * dy
+                    s0, sy, syy = s0 + g_sigma, sy + by_y, syy + by_y * dy
+                    dy = dy - one
+                sx = s0 * dx
+                store(
+                    sums, np.int64(slots[k + j]) * SUMS,
+                    lanes.totals((s0, sx, sy, sx * dx, sy * dx, syy, s_red, s_green, s_blue, s_z)),
+                )  # fmt: skip
 
 
-@kernel()
-def drawn_starts_of(last, columns, tile_count):
-    """Prefix sums (tiles + 1,) of how many of each tile's Gaussians were looked at by any pixel to the end."""
-    starts = np.zeros(tile_count + 1, np.int64)
-    height, width = last.shape
-    for y in range(height):
-        for x in range(width):
-            tile = (y // TILE) * columns + x // TILE
-            starts[tile + 1] = max(starts[tile + 1], last[y, x] + 1)
-    for tile in range(tile_count):
-        starts[tile + 1] += starts[tile]
-    return starts
-
-
-@kernel()
-def gather(begin, end, offsets, slot_tiles, slot_places, starts, drawn_starts, sums, g_means2d, g_splats):
-    """Adds up, for Gaussians begin .. end - 1, their intersections' gradients, always in the same order."""
-    for i in range(begin, end):
-        g_means2d[i] = 0
-        g_splats[i] = 0
-        for slot in range(offsets[i], offsets[i + 1]):
-            tile = slot_tiles[slot]
-            k = slot_places[slot] - starts[tile]
-            if k < drawn_starts[tile + 1] - drawn_starts[tile]:
-                row = sums[drawn_starts[tile] + k]
-                g_means2d[i, 0] += row[0]
-                g_means2d[i, 1] += row[1]
-                for j in range(8):
-                    g_splats[i, j] += row[2 + j]
+@kernel(error_model="numpy")
+def gather(begin, end, order, offsets, splats, sums, g_means2d, g_splats):
+    """Adds up the sums of Gaussians order[begin] .. order[end - 1], always in the same order; writes gradients."""
+    half = splats.dtype.type(0.5)
+    row = np.empty(SUMS, splats.dtype)
+    for rank in range(begin, end):
+        i = order[rank]
+        total = fill(splats.dtype.type(0))
+        for slot in range(offsets[rank], offsets[rank + 1]):
+            total = total + load(sums, slot * SUMS)
+        store(row, 0, total)
+        a, b, c, opacity = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 3]
+        g_means2d[i, 0], g_means2d[i, 1] = a * row[1] + b * row[2], b * row[1] + c * row[2]
+        g_splats[i, 0], g_splats[i, 1], g_splats[i, 2] = half * row[3], row[4], half * row[5]
+        g_splats[i, 3] = -row[0] / opacity if opacity > 0 else row[0]
+        for k in range(4):
+            g_splats[i, 4 + k] = row[6 + k]
+        for k in range(8, RECORD):
+            g_splats[i, k] = 0

@@ -3,10 +3,14 @@
 Conventions as gsplat's "classic" mode: covariance J W R S S R^T W^T J^T + 0.3 I in pixels, the Jacobian J
 taken at x/z and y/z clamped to the image widened by 30 % of half its field of view.
 
-Per Gaussian, besides means2d (N, 2):
-  splats (N, 8): conic a, b, c (sigma = (a dx^2 + c dy^2) / 2 + b dx dy), opacity, red, green, blue, camera z
-  extents (N, 3): half width and half height in pixels of the box around all alpha >= 1/255, and
-    tau = 2 ln(255 opacity), the squared radius of that isoline; all zero for Gaussians not drawn.
+Per Gaussian, besides means2d (N, 2), one record of splats (N, RECORD), as long as a cache line; all zero for
+Gaussians not drawn:
+  0 to 7: conic a, b, c (sigma = (a dx^2 + c dy^2) / 2 + b dx dy), opacity, red, green, blue, camera z: the part
+    that is differentiated
+  8, 9: means2d once more
+  10, 11: half width and half height in pixels of the box around all alpha >= 1/255
+  12: tau = 2 ln(255 opacity), the squared radius of that isoline
+  13: log2 of the opacity
 `camera` is (20,): world-to-camera rotation by rows, translation, fx, fy, cx, cy, camera centre, near plane.
 """
 
@@ -17,11 +21,17 @@ import math
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
+from visdom_plugin.compute.lanes import fill, store
 from visdom_plugin.geometry.harmonics import basis, basis_gradient
+from visdom_plugin.splat.cpu.tiles import count_tiles
 
 DILATION = 0.3  # px^2, 3DGS's low-pass filter
 ALPHA_MIN = 1 / 255
+LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 FRUSTUM_MARGIN = 0.3
+RECORD = 16
+"""Numbers per Gaussian in `splats`."""
+LOG2_E = 1 / math.log(2)
 
 
 @kernel(error_model="numpy")
@@ -67,19 +77,21 @@ def _camera_point(mean, camera):
 @kernel(error_model="numpy")
 def project(
     begin, end, means, log_scales, quaternions, opacity_logits, sh, degree, camera, width, height,
-    means2d, splats, extents, radii,
+    means2d, splats, radii, tiles,
 ):  # fmt: skip
-    """Projects Gaussians begin .. end - 1; see the module's text for the arrays written."""
+    """Projects Gaussians begin .. end - 1; see the module's text for the arrays written.
+
+    `radii` (N, 2) are gsplat's, in whole pixels, and `tiles` (N,) how many tiles of the image each meets.
+    """
     real = means.dtype.type
     one, zero = real(1), real(0)
     fx, fy, cx, cy, near = camera[12], camera[13], camera[14], camera[15], camera[19]
     m, s, values = np.empty((3, 3), means.dtype), np.empty(3, means.dtype), np.empty(16, means.dtype)
     n_basis = (degree + 1) * (degree + 1)
     for i in range(begin, end):
-        means2d[i] = zero
-        splats[i] = zero
-        extents[i] = zero
-        radii[i] = 0
+        store(splats, i * RECORD, fill(zero))
+        means2d[i, 0], means2d[i, 1] = zero, zero
+        radii[i, 0], radii[i, 1], tiles[i] = 0, 0, 0
         x, y, z = _camera_point(means[i], camera)
         opacity = one / (one + math.exp(-opacity_logits[i]))
         # Written so that NaN fails.
@@ -109,10 +121,13 @@ def project(
         splats[i, 0], splats[i, 1], splats[i, 2] = yy / determinant, -xy / determinant, xx / determinant
         splats[i, 3], splats[i, 7] = opacity, z
         radii[i, 0], radii[i, 1] = np.int32(radius_x), np.int32(radius_y)
+        splats[i, 8], splats[i, 9] = u, v
         # A hundredth of a pixel more: rounding must never cut what the test of alpha would keep.
-        extents[i, 0] = math.sqrt(tau * xx) + real(0.01)
-        extents[i, 1] = math.sqrt(tau * yy) + real(0.01)
-        extents[i, 2] = tau * real(1.001) + real(0.001)
+        splats[i, 10] = math.sqrt(tau * xx) + real(0.01)
+        splats[i, 11] = math.sqrt(tau * yy) + real(0.01)
+        splats[i, 12] = tau * real(1.001) + real(0.001)
+        splats[i, 13] = real(0.5 * LOG2_E) * tau + real(LOG2_ALPHA_MIN)
+        tiles[i] = count_tiles(splats, i, width, height)
 
         dx, dy, dz = means[i, 0] - camera[16], means[i, 1] - camera[17], means[i, 2] - camera[18]
         length = max(math.sqrt(dx * dx + dy * dy + dz * dz), real(1e-12))
@@ -127,7 +142,7 @@ def project(
 
 @kernel(error_model="numpy")
 def project_backward(
-    begin, end, means, log_scales, quaternions, sh, degree, camera, width, height, splats, extents,
+    begin, end, means, log_scales, quaternions, sh, degree, camera, width, height, splats,
     g_means2d, g_splats, g_means, g_log_scales, g_quaternions, g_opacity_logits, g_sh,
 ):  # fmt: skip
     """Writes the gradients of Gaussians begin .. end - 1 from those of means2d and splats."""
@@ -139,12 +154,14 @@ def project_backward(
     values, slopes = np.empty(16, means.dtype), np.empty((16, 3), means.dtype)
     n_basis = (degree + 1) * (degree + 1)
     for i in range(begin, end):
-        if extents[i, 2] == zero:
-            g_means[i] = zero
-            g_log_scales[i] = zero
-            g_quaternions[i] = zero
+        if splats[i, 12] == zero:
+            for k in range(3):
+                g_means[i, k], g_log_scales[i, k] = zero, zero
+            for k in range(4):
+                g_quaternions[i, k] = zero
             g_opacity_logits[i] = zero
-            g_sh[i] = zero
+            for k in range(sh.shape[1]):
+                g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = zero, zero, zero
             continue
         x, y, z = _camera_point(means[i], camera)
         _axes(i, log_scales, quaternions, camera, m, s)
@@ -202,7 +219,7 @@ def project_backward(
         for k in range(n_basis):
             g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = values[k] * red, values[k] * green, values[k] * blue
         for k in range(n_basis, sh.shape[1]):
-            g_sh[i, k] = zero
+            g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = zero, zero, zero
         if degree > 0:
             basis_gradient(degree, dx, dy, dz, slopes)
             gx, gy, gz = zero, zero, zero
