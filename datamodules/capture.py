@@ -43,7 +43,7 @@ class Frame:
     """File whose pixels that are not black are unknown (instant-ngp's dynamic masks); None looks for a file of
     the photograph's name in the folder `ignore`."""
     depth: str | None = None
-    """16-bit PNG of monocular depth times 1000; need not exist."""
+    """Monocular depth, a 16-bit PNG of it times 1000 or .npy in any unit; need not exist."""
 
 
 class Calibration(NamedTuple):

@@ -164,18 +164,38 @@ def is_lossless(data: bytes, path: Path) -> bool:
 
 
 def decode_depth(data: bytes, path: Path) -> np.ndarray:
-    """(H, W) float32: a 16-bit PNG of monocular depth times 1000, divided by 1000 again."""
+    """(H, W) float32 monocular depth, 0 where unknown: a 16-bit PNG of it times 1000, divided by 1000 again, or an
+    array of numpy as it is."""
     import cv2
 
+    if path.suffix.lower() == ".npy":
+        return _depth_array(data, path)
     image = _decode(data, path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype != np.uint16:
         raise SceneError(
             f"a depth map must be a 16-bit grey PNG, this one has shape {image.shape} and type {image.dtype}",
             where=path,
             cause="the coloured preview was saved in its place",
-            todo="save depth x 1000 as 16-bit PNG, or remove the folder zoe_depth to train without it",
+            todo=f"save depth x 1000 as 16-bit PNG, or remove the folder {path.parent.name} to train without it",
         )
     return image.astype(np.float32) / np.float32(1000)
+
+
+def _depth_array(data: bytes, path: Path) -> np.ndarray:
+    try:
+        found = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        _damaged(path, f"the array cannot be read: {str(error)[:120]}")
+    depth = np.squeeze(found) if isinstance(found, np.ndarray) else np.zeros(0)
+    if depth.ndim != 2 or depth.dtype.kind not in "fiu":
+        raise SceneError(
+            f"a depth map must be an array of numbers (H, W), this one has shape {depth.shape} and type "
+            f"{depth.dtype}",
+            where=path,
+            todo="save the depth alone with numpy.save, larger where farther, 0 where unknown",
+        )
+    depth = depth.astype(np.float32)
+    return np.where(np.isfinite(depth), depth, np.float32(0))
 
 
 def shrink(image: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -4,6 +4,8 @@ sparse/<n>, sparse, colmap/sparse/<n>, dense/sparse, sparse_<N>/<n> or the folde
                                         the model, text or binary; of several, the one with most photographs
 images/ or images_<F>/                  photographs, F times smaller in the latter
 masks/                                  foreground masks, named after the photographs; or alpha channels
+depths/                                 optional monocular depth, named after the photographs: .npy (H, W) in any
+                                        unit, or 16-bit PNG of depth times 1000
 
 Every 8th view by name is for testing and training views are spread evenly over the others, unless index files
 or lists say otherwise.
@@ -63,7 +65,7 @@ def read_capture(
         folder: of the model below the root, for layouts that have one place for it; None looks in the usual
             places and takes the model with most photographs.
         indexed: whether index files are demanded.
-        depths: folder of monocular depth maps, where the layout has one.
+        depths: folder of monocular depth maps that a layout has in place of `depths`.
     """
     chosen, said = choose_model(root, request.colmap_model)
     folder = chosen if folder is None or request.colmap_model else folder
@@ -89,9 +91,10 @@ def read_capture(
     for name in names:
         check_name(name, model.folder, outside=request.allow_outside)
     registered = dict(zip(names, model.images, strict=True))
+    maps = next((f for f in (depths, "depths") if f is not None and (root / f).is_dir()), None)
     frames = sort_frames(
         [
-            Frame(name, f"images/{name}", depth=None if depths is None else f"{depths}/{stem(name)}.png")
+            Frame(name, f"images/{name}", depth=None if maps is None else _depth_file(root, maps, stem(name)))
             for name in names
         ]
     )
@@ -113,3 +116,21 @@ def read_capture(
         honours=("colmap_model",),
         notes=(*notes, *said),
     )
+
+
+def _depth_file(root: Path, folder: str, view: str) -> str:
+    """Where a view's depth map lies, below the root, if there is one.
+
+    Raises:
+        SceneError: there are two.
+    """
+    array, picture = (f"{folder}/{view}{ending}" for ending in (".npy", ".png"))
+    if not (root / array).is_file():
+        return picture
+    if (root / picture).is_file():
+        raise SceneError(
+            f"there are two depth maps of one view, {array} and {picture}",
+            where=root,
+            todo="take one of them away; a preview in colours belongs into another folder",
+        )
+    return array

@@ -85,6 +85,10 @@ class ViewReader:
             flat = undistort(scaled, distortion, image, soft, unknown, where=photo.path)
             image, unknown = flat.image, flat.ignore
             soft = soft if flat.mask is None else flat.mask
+        depth = side_files.read_depth(reading, file, full, photo.target)
+        remarks = (*photo.remarks, *found.remarks)
+        if depth is not None and distortion is not None:
+            remarks += ("depth maps are taken to be of the photographs without lens distortion",)
         width, height = photo.target
         mask = np.ones((height, width), bool)
         if masked:
@@ -102,10 +106,10 @@ class ViewReader:
             image=torch.from_numpy(image),
             mask=torch.from_numpy(mask),
             ignore=None if unknown is None else torch.from_numpy(unknown),
-            depth=side_files.read_depth(reading, file, full, photo.target),
+            depth=depth,
             masked=masked,
             soft=masks.soft_share(soft) if masked else 0.0,
-            remarks=(*photo.remarks, *found.remarks),
+            remarks=remarks,
         )
 
     def _inspect(self, i: int) -> InspectedView:

@@ -90,14 +90,16 @@ def read_depth(
     if path is None or not path.is_file():
         return None
     data = read_file(path)
-    size = images.read_header(data, path).size
+    decoded = images.decode_depth(data, path) if path.suffix.lower() == ".npy" else None
+    size = images.read_header(data, path).size if decoded is None else decoded.shape[::-1]
     if abs(size[0] * full[1] - size[1] * full[0]) > max(full):
         raise SceneError(
             f"the depth map is {size[0]} x {size[1]}, another shape than its image's {full[0]} x {full[1]}",
             where=path,
             todo="make the depth map from the image, or remove it",
         )
-    return torch.from_numpy(images.shrink_nearest(images.decode_depth(data, path), *target))
+    depth = images.decode_depth(data, path) if decoded is None else decoded
+    return torch.from_numpy(images.shrink_nearest(depth, *target))
 
 
 def resize(soft: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -155,6 +155,25 @@ def test_monocular_depth_is_read_for_the_views_that_have_it(tiny, folder):
     assert "mono_depths" in scene.source["hashes"]
 
 
+def test_depth_beside_the_photographs_is_read_as_array_or_picture(tiny, folder):
+    (folder / "depths").mkdir()
+    names = list(tiny.train.names)
+    depth = np.random.default_rng(0).random((36, 48)).astype(np.float32) + 1
+    depth[0, 0] = np.nan
+    np.save(folder / "depths" / f"{names[0]}.npy", depth)
+    np.save(folder / "depths" / f"{names[1]}.npy", depth.astype(np.float64)[None])
+    write(folder / "depths" / f"{names[2]}.png", (1000 * np.nan_to_num(depth)).astype(np.uint16))
+    maps = load(folder).train.mono_depths
+    assert torch.equal(maps[0], torch.from_numpy(np.nan_to_num(depth))) and torch.equal(maps[0], maps[1])
+    torch.testing.assert_close(maps[2], maps[0], rtol=0, atol=1e-3)
+    assert maps[3] is None
+    assert torch.equal(load(folder, downscale=2).train.mono_depths[0], maps[0][1::2, 1::2])
+    # A layout's own folder comes first.
+    (folder / "zoe_depth").mkdir()
+    write(folder / "zoe_depth" / f"{names[3]}.png", np.full((36, 48), 2000, np.uint16))
+    assert [d is None for d in load(folder).train.mono_depths] == [True, True, True, False]
+
+
 def test_views_default_to_the_smallest_list(tiny, folder):
     (folder / "sparse_3.txt").write_text("\n".join((folder / "sparse_4.txt").read_text().split()[1:]))
     assert list(load(folder).train.names) == [f"{n}.png" for n in tiny.train.names[1:]]

@@ -192,7 +192,24 @@ FAULTS = {
         lambda f: ((f / "zoe_depth").mkdir(), write(f / "zoe_depth/train_000.png", np.ones((40, 36), np.uint16))),
         ["36 x 40", "train_000"],
     ),
+    "depth array of another shape": (lambda f: _depths(f, np.ones((40, 36))), ["36 x 40", "train_000"]),
+    "depth array in colours": (lambda f: _depths(f, np.ones((36, 48, 3))), ["(H, W)", "train_000"]),
+    "depth array of words": (lambda f: _depths(f, np.full((36, 48), "a")), ["(H, W)", "train_000"]),
+    "depth array of objects": (lambda f: _depths(f, np.full((36, 48), None)), ["cannot be read", "train_000"]),
+    "depth array cut": (
+        lambda f: (_depths(f, np.ones((36, 48))), _cut(f / "depths/train_000.npy", 0.5)),
+        ["cannot be read", "train_000"],
+    ),
+    "two depth maps of a view": (
+        lambda f: (_depths(f, np.ones((36, 48))), write(f / "depths/train_000.png", np.ones((36, 48), np.uint16))),
+        ["two depth maps", "train_000"],
+    ),
 }  # fmt: skip
+
+
+def _depths(folder, array):
+    (folder / "depths").mkdir()
+    np.save(folder / "depths/train_000.npy", array)
 
 
 @pytest.mark.parametrize("fault", FAULTS)
