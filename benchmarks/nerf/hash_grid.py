@@ -1,3 +1,4 @@
+# ruff: noqa: E402
 """Speed of the hash encoding on the CPU, forward and backward, against the plain torch version of the same run.
 
     python benchmarks/nerf/hash_grid.py [--repeats 10] [--one-thread]
@@ -11,6 +12,10 @@ from __future__ import annotations
 
 import argparse
 import time
+
+from visdom_plugin.compute.openmp import wait_briefly
+
+wait_briefly()  # before torch is imported, as the commands do
 
 import torch
 

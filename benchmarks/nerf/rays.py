@@ -1,3 +1,4 @@
+# ruff: noqa: E402
 """Time of a NeRF's work on rays, hash grid and nets apart: kernels for the CPU against the same in plain torch.
 
     python benchmarks/nerf/rays.py [--rays 1024] [--repeats 15]
@@ -9,6 +10,10 @@ from __future__ import annotations
 
 import argparse
 import time
+
+from visdom_plugin.compute.openmp import wait_briefly
+
+wait_briefly()  # before torch is imported, as the commands do
 
 import torch
 

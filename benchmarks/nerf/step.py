@@ -1,3 +1,4 @@
+# ruff: noqa: E402
 """A training step of each radiance field with the sampler against the same without, pairwise in one run.
 
     python benchmarks/nerf/step.py --method ingp --steps 200
@@ -13,6 +14,10 @@ import argparse
 import statistics
 import time
 from dataclasses import replace
+
+from visdom_plugin.compute.openmp import wait_briefly
+
+wait_briefly()  # before torch is imported, as the commands do
 
 import torch
 

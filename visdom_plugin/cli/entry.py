@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
 from visdom_plugin.cli.early import read_early
+from visdom_plugin.compute.openmp import wait_briefly
 from visdom_plugin.errors import ConfigError, VisDomError
 from visdom_plugin.hull.wording import for_commands
 
@@ -36,6 +37,7 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
     """
     words = list(sys.argv[1:] if argv is None else argv)
     early = read_early(words)
+    wait_briefly()
     set_up_logging(early.quiet)
     if early.version:
         print(f"visdom-plugin {version('visdom-plugin')}")
