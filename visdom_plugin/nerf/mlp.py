@@ -1,14 +1,27 @@
-"""From encoded points to density and colour: the small networks of the radiance fields."""
+"""From encoded points to density and colour: the small networks of the radiance fields.
+
+On the CPU a net of layers at most `WIDEST` wide runs as one kernel; wider ones, and other devices, in plain torch.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
+import numpy as np
 import torch
 from torch import Generator, Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from visdom_plugin.compute.parallel import parallel_for
+from visdom_plugin.nerf import mlp_kernels
+
+CALLS = 32
+"""About into how many calls the work on all points is divided, so that many threads have work."""
+WIDEST = 96
+"""Inputs or outputs of a layer. Beyond, a matrix product of torch's is as fast."""
 
 
 class TruncatedExp(torch.autograd.Function):
@@ -32,6 +45,123 @@ class TruncatedExp(torch.autograd.Function):
 truncated_exp = TruncatedExp.apply
 
 
+class Perceptron(nn.Sequential):
+    """Linear layers with ReLU between them; (..., inputs) to (..., outputs)."""
+
+    def forward(self, x: Tensor, extra: Tensor | None = None, *, lead: int = 0) -> Tensor:
+        """See `run_layers`."""
+        return run_layers([layer for layer in self if isinstance(layer, nn.Linear)], x, extra, lead=lead)
+
+
+def run_layers(
+    layers: Sequence[nn.Linear],
+    x: Tensor,
+    extra: Tensor | None = None,
+    *,
+    lead: int = 0,
+    again: int | None = None,
+) -> Tensor:
+    """Linear layers with ReLU between them.
+
+    Args:
+        layers: from first to last; all with biases or all without.
+        x: (n, lead + a) or (..., lead + a) input, of which the first `lead` numbers are left out. Differentiable.
+        extra: (m, b) or (..., b), more of the input, behind x; each row serves n / m points in a row. A constant.
+        again: the layer that is fed the whole input once more, behind the output of the layer before it.
+
+    Returns:
+        (..., outputs).
+    """
+    points, rest = x.reshape(-1, x.shape[-1]), None if extra is None else extra.detach().flatten(0, -2)
+    widest = max(max(layer.in_features, layer.out_features) for layer in layers)
+    parameters = [p for layer in layers for p in (layer.weight, layer.bias) if p is not None]
+    if (
+        x.device.type == "cpu"
+        and widest <= WIDEST
+        and all(t.dtype == torch.float32 for t in (x, *parameters))
+    ):
+        shape = Shape(
+            tuple((layer.in_features, layer.out_features) for layer in layers),
+            len(parameters) > len(layers),
+            lead,
+            -1 if again is None else again,
+        )
+        out = _Layers.apply(points, rest, shape, *parameters)
+    else:
+        out = run_layers_torch(layers, points, rest, lead=lead, again=again)
+    return out.reshape(*x.shape[:-1], layers[-1].out_features)
+
+
+def run_layers_torch(
+    layers: Sequence[nn.Linear], x: Tensor, extra: Tensor | None, *, lead: int = 0, again: int | None = None
+) -> Tensor:
+    """`run_layers` in plain torch, for x (n, lead + a) and extra (m, b)."""
+    x = x[:, lead:]
+    if extra is not None:
+        x = torch.cat([x, extra.repeat_interleave(len(x) // max(len(extra), 1), 0)], -1)
+    h = x
+    for i, layer in enumerate(layers):
+        if i:
+            h = h.relu()
+        if i == again:
+            h = torch.cat([h, x], -1)
+        h = layer(h)
+    return h
+
+
+class Shape(NamedTuple):
+    """What a kernel has to know of a net beside its parameters."""
+
+    sizes: tuple[tuple[int, int], ...]
+    """Inputs and outputs of each layer."""
+    biased: bool
+    lead: int
+    again: int
+    """-1 for none."""
+
+
+class _Layers(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, extra, shape, *parameters):
+        x = x.contiguous()
+        extra = x.new_empty(1, 0) if extra is None else extra.float().contiguous()
+        ctx.save_for_backward(x, extra, *parameters)
+        ctx.shape = shape
+        out = torch.empty(len(x), shape.sizes[-1][1])
+        none = np.empty(0, np.float32)
+        _run(x, extra, shape, parameters, _flat(out), none, none, np.empty((0, 0), np.float32))
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, g_out):
+        x, extra, *parameters = ctx.saved_tensors
+        g_x = torch.empty_like(x)
+        counts = [p.numel() for p in parameters]
+        sums = np.empty((-(-len(x) // mlp_kernels.PIECE), sum(counts)), np.float32)
+        none = np.empty(0, np.float32)
+        _run(x, extra, ctx.shape, parameters, none, _flat(g_out.contiguous()), _flat(g_x), sums)
+        split = torch.from_numpy(sums.sum(0)).split(counts)
+        return g_x, None, None, *(g.view_as(p) for g, p in zip(split, parameters, strict=True))
+
+
+def _run(x: Tensor, extra: Tensor, shape: Shape, parameters: Sequence[Tensor], *results: np.ndarray) -> None:
+    repeat = max(len(x) // max(len(extra), 1), 1)
+    numbers = (len(x), x.shape[1], shape.lead, extra.shape[1], repeat, shape.again, shape.biased)
+    sizes = np.array([*shape.sizes, (shape.sizes[-1][1], 0)], np.int64)
+    flat = torch.cat([p.detach().reshape(-1) for p in parameters])
+    pieces = -(-len(x) // mlp_kernels.PIECE)
+    # A call packs the parameters before it begins.
+    grain = max(pieces // CALLS, 1)
+    parallel_for(
+        mlp_kernels.run, pieces, grain, numbers, sizes, _flat(flat), _flat(x), _flat(extra), *results
+    )
+
+
+def _flat(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().numpy().reshape(-1)
+
+
 Layer: TypeAlias = nn.Linear | nn.Conv1d | nn.Conv2d | nn.Conv3d
 
 
@@ -43,7 +173,7 @@ def draw_weights(layer: Layer, most: float, generator: Generator) -> None:
         layer.bias.zero_()
 
 
-def perceptron(sizes: Sequence[int], generator: Generator, *, bias: bool = False) -> nn.Sequential:
+def perceptron(sizes: Sequence[int], generator: Generator, *, bias: bool = False) -> Perceptron:
     """Linear layers with ReLU between them, weights uniform within +-sqrt(6 / inputs) (He et al. 2015).
 
     The last layer, which has no ReLU behind it, takes +-sqrt(3 / inputs). Without biases, as in Instant-NGP,
@@ -59,4 +189,4 @@ def perceptron(sizes: Sequence[int], generator: Generator, *, bias: bool = False
         layer = nn.Linear(n, m, bias=bias)
         draw_weights(layer, math.sqrt((3 if last else 6) / n), generator)
         layers += [layer] if last else [layer, nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers)
+    return Perceptron(*layers)

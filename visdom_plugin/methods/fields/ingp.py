@@ -73,16 +73,17 @@ class Ingp(MarchedField[IngpConfig]):
         self._rays = int(state["rays"])
 
     def _features(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Density (m,), and the density network's outputs (m, 1 + geometry_features)."""
         c = self.config
         unit = points * (0.5 / c.half_side) + 0.5
         out = self.density_net(encode(unit, self.table, c.grid))
-        return truncated_exp(out[:, 0] + c.density_bias), out[:, 1:]
+        return truncated_exp(out[:, 0] + c.density_bias), out
 
     def _encode_views(self, directions: Tensor) -> Tensor:
         return encode_harmonics(directions)[..., : self.config.view_degree**2]
 
     def _look(self, features: Tensor, views: Tensor) -> Tensor:
-        return self.colour_net(torch.cat([features, views], -1)).sigmoid()
+        return self.colour_net(features, views, lead=1).sigmoid()
 
     def _adapt(self, rays: int, samples: int) -> None:
         wanted = int(rays * self.config.samples_per_step / max(samples, 1))

@@ -30,7 +30,7 @@ from visdom_plugin.nerf.encoding.hash_grid import (
     mean_square_per_level,
 )
 from visdom_plugin.nerf.encoding.view_directions import encode_sinusoids
-from visdom_plugin.nerf.mlp import perceptron, truncated_exp
+from visdom_plugin.nerf.mlp import perceptron, run_layers, truncated_exp
 from visdom_plugin.nerf.optimiser import FieldOptimiser, warm_up_and_decay
 from visdom_plugin.nerf.rendering.proposal_losses import antialiased_interlevel_loss, distortion_loss
 from visdom_plugin.nerf.rendering.volume import composite, weights_from_density
@@ -64,7 +64,7 @@ class AntialiasedGrid(nn.Module):
         contracted, std = contract(points, std)
         features, weights = encode_mean(contracted * 0.25 + 0.5, std * 0.25, self.table, self.layout)
         magnitude = (INITIAL_FEATURE**2 + mean_square_per_level(self.table.detach(), self.layout)).sqrt()
-        return self.net(torch.cat([features, (2 * weights - 1) * magnitude], -1))
+        return self.net(features, (2 * weights - 1) * magnitude)
 
     def decay(self) -> Tensor:
         """Mean squares of the table, summed over the levels."""
@@ -85,13 +85,13 @@ class ColourNet(nn.Module):
             width = hidden
         self.last = perceptron([width, 3], generator, bias=True)
 
-    def forward(self, x: Tensor) -> Tensor:
-        h = x
-        for i, layer in enumerate(self.layers):
-            if i and i + 1 == len(self.layers):
-                h = torch.cat([h, x], -1)
-            h = layer(h).relu()
-        return self.last(h).sigmoid() * (1 + 2 * RGB_PADDING) - RGB_PADDING
+    def forward(self, seen: Tensor, views: Tensor) -> Tensor:
+        """Colours (..., 3) of a density network's outputs (..., 1 + bottleneck), the first of which is left out,
+        and of encoded directions (..., v), one for several points in a row."""
+        linears = [*self.layers, self.last[0]]
+        again = len(self.layers) - 1
+        rgb = run_layers(linears, seen, views, lead=1, again=again if again else None)
+        return rgb.sigmoid() * (1 + 2 * RGB_PADDING) - RGB_PADDING
 
 
 class Level(NamedTuple):
@@ -134,7 +134,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         background = self.draw_background(len(batch.mask), draw)
         rays = self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
         levels, out = self._see(rays, batch.radii, c.samples, step, draw)
-        colours = self._shade(out[..., 1:], rays.directions[:, None])
+        colours = self._shade(out, rays.directions[:, None])
         last = levels[-1]
         rgb, alpha, _ = composite(last.weights, colours, last.t, background)
         rgb = self.correct(rgb, alpha, background, batch.pixels)
@@ -258,14 +258,12 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
             left, out, level = left[seen], out[seen], Level(*(x[seen] for x in level))
             rays = LocalRays(*(x[seen] for x in rays))
         if level is not None and len(left):
-            colours = self._shade(out[..., 1:], rays.directions[:, None])
+            colours = self._shade(out, rays.directions[:, None])
             rgb[left], alpha[left], depth[left] = composite(level.weights, colours, level.t, background)
         return rgb, alpha, depth
 
-    def _shade(self, bottleneck: Tensor, directions: Tensor) -> Tensor:
-        view = encode_sinusoids(directions, self.config.view_degree)
-        view = view.expand(*bottleneck.shape[:-1], view.shape[-1])
-        return self.model["colour"](torch.cat([bottleneck, view], -1))
+    def _shade(self, seen: Tensor, directions: Tensor) -> Tensor:
+        return self.model["colour"](seen, encode_sinusoids(directions, self.config.view_degree))
 
     def _grid(self, name: str) -> AntialiasedGrid:
         grid = self.model[name]
@@ -282,4 +280,4 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         return truncated_exp(self._field(points)[:, 0] + self.config.density_bias)
 
     def _colour(self, points: Tensor, directions: Tensor) -> Tensor:
-        return self._shade(self._field(points)[:, 1:], directions.to(self.device))
+        return self._shade(self._field(points), directions.to(self.device))
