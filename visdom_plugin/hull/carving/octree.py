@@ -291,7 +291,7 @@ def _carve(
             i0, j0, k0 = corner[height, 0], corner[height, 1], corner[height, 2]
             size, visible, occupied = counts[height, 0], counts[height, 1], counts[height, 2]
             i1, j1, k1 = min(i0 + size, nx), min(j0 + size, ny), min(k0 + size, nz)
-            count = 0
+            count = 0 * views  # a mere 0 is a type of its own, and functions are compiled for it once more
             for q in range(counts[height, 3]):
                 view = open_views[height, q]
                 said = _judge(view, i0, i1 - 1, j0, j1 - 1, k0, k1 - 1, x, y, z, slack, sizes, starts, tables)

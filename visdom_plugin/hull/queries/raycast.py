@@ -203,12 +203,17 @@ def _cast(
 ) -> None:  # fmt: skip
     # One origin may serve all rays of a camera.
     step = 0 if len(origins) == 1 else 1
-    size = np.array([4.0 * shape[0], 4.0 * shape[1], 4.0 * shape[2]])
+    size, zero = (
+        np.empty(3),
+        0 * len(shape),
+    )  # a mere 0 is a type of its own: the walk would be compiled twice
+    for a in range(3):
+        size[a] = 4.0 * shape[a]
     rays, turns, ends = np.empty((_PACK, 14)), np.empty((_PACK, 6), np.int64), np.empty((_PACK, 7))
     met, active, index = np.empty(_PACK, np.bool_), np.empty(_PACK, np.uint64), np.empty(_PACK, np.int64)
     r = begin
     while r < end:
-        count = 0
+        count = zero
         while r < end and count < _PACK:
             first[r], last[r], hit[r] = 0, 0, False
             near, far, length, reach = 0.0, np.inf, 0.0, 0.0
@@ -231,12 +236,13 @@ def _cast(
                 count += 1
             r += 1
         _walk_pack(count, rays, turns, met, active, size, bits, ahead)
-        hits = 0
+        hits = zero
         for n in range(count):
             if met[n]:
                 t, far = rays[n, 12], ends[n, 6]
                 first[index[n]], hit[index[n]] = t, True
-                rays[hits, :6] = ends[n, :6]
+                for a in range(6):  # an assignment of slices takes 2 s to compile
+                    rays[hits, a] = ends[n, a]
                 ends[hits, 6], index[hits] = far, index[n]
                 _set_out(rays, turns, hits, 0.0, far - t, size, shape)
                 hits += 1
@@ -274,8 +280,10 @@ def _walk(
 ) -> tuple[Tensor, Tensor, Tensor]:
     origins = origins.reshape(1, 3) if origins.numel() == 3 else origins.expand(*shape, 3).reshape(-1, 3)
     directions = directions.expand(*shape, 3).reshape(-1, 3)
-    if directions.dtype != torch.float32 or origins.dtype != torch.float32:
-        directions, origins = directions.double(), origins.double()
+    directions, origins = (
+        directions.double(),
+        origins.double(),
+    )  # one type, or the kernel is compiled for each
     bricks = hull._once("bricks", lambda: build_bricks(hull.occupancy))
     first, last = np.empty(len(directions)), np.empty(len(directions))
     hit = np.empty(len(directions), np.bool_)

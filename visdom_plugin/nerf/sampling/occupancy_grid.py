@@ -165,7 +165,8 @@ def _fill(
     for r in range(begin, end):
         at = offsets[r]
         _walk(r, origins, directions, near, far, step, shift, occupied, half_side, starts, at)
-        rays[at : offsets[r + 1]] = r
+        for i in range(at, offsets[r + 1]):
+            rays[i] = r
 
 
 @kernel(inline="always")
