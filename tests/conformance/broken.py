@@ -12,24 +12,13 @@ import numpy as np
 import torch
 from my_method.field import Field as WholeField
 
-from method_configs import (
-    corgs_lite,
-    fsgs_lite,
-    gs_go,
-    ingp,
-    visdom_field,
-    visdom_gs,
-    zerorf_lite,
-    zipnerf_lite,
-)
-from visdom_plugin.hooks.configs import RegularizerConfig, SamplerConfig
+from method_configs import gs_go
+from tests.conformance.whole import HULL, built_in, splat_presets
+from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import RayBounds
-from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.splats.gs_go import GsGo
-from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 from visdom_plugin.registry import MethodSpec, Preset, SamplerMethodConfig
 
-HULL = VisibleDomain(resolution=48, dilate_px=1)
 BROKEN: dict[str, str] = {}
 """Name of the broken method to the check that it fails."""
 CLASSES: dict[str, tuple[type, type | None]] = {}
@@ -320,97 +309,17 @@ def _field_spec(name: str, target: str, settings: type, vd: type | None) -> Meth
     )
 
 
-SMALL_SPLATS = {"steps": 24, "initial_points": 400, "max_gaussians": 600}
-SMALL_INGP = {
-    "steps": 40,
-    "max_rays": 256,
-    "samples_per_step": 1 << 12,
-    "step_length": 0.03,
-    "missing_step_length": 0.2,
-    "grid": HashLayout(4, 2, base_resolution=8, max_resolution=64, log2_table_size=12),
-    "occupancy_resolution": 32,
-}
-
-
-def _splat_presets(name: str, target: str, module) -> list[Preset]:
-    bare = replace(module.SPEC.quick, **SMALL_SPLATS, mask_weight=0.0)
-    regularizer = RegularizerConfig(enabled=True, weight=0.1, prune_every=10, bank=4)
-    # Wide, as the bare methods' hull is: it is the losses' doing that opacity falls.
-    vd = replace(bare, mask_weight=1.0, hull=HULL, vd=regularizer, lr_opacity=0.1)
-    return [Preset(name, "", target, bare, bare), Preset(f"{name}+vd", "", target, vd, vd)]
-
-
-def _field_presets(name: str, target: str, module, **small) -> list[Preset]:
-    bare = replace(module.SPEC.quick, **small)
-    vd = replace(bare, mask_weight=0.1, background="random", hull=HULL, vd=SamplerConfig(enabled=True))
-    return [Preset(name, "", target, bare, bare), Preset(f"{name}+vd", "", target, vd, vd)]
-
-
-def _recipe(name: str, module, small: dict) -> Preset:
-    """A method that has no variant without the hook."""
-    (whole,) = module.SPEC.presets().values()
-    config = replace(whole.quick, **small, hull=HULL)
-    return Preset(name, "", whole.target, config, config)
-
-
 def _methods() -> list[MethodSpec | Preset]:
     found: list[MethodSpec | Preset] = [_field_spec("SmallField", "my_method.field:Field", TinyField, None)]
     for name, (broken, vd) in CLASSES.items():
         target = f"{__name__}:{name}"
         globals().setdefault(name, broken)
         found += (
-            _splat_presets(name, target, gs_go)
+            splat_presets(name, target, gs_go)
             if issubclass(broken, GsGo)
             else [_field_spec(name, target, broken.settings, vd)]
         )
-    found += _splat_presets("SmallGsGo", "visdom_plugin.methods.splats.gs_go:GsGo", gs_go)
-    found += _splat_presets("SmallCorgs", "visdom_plugin.methods.splats.corgs_lite:CorgsLite", corgs_lite)
-    found += _splat_presets("SmallFsgs", "visdom_plugin.methods.splats.fsgs.method:FsgsLite", fsgs_lite)
-    found.append(
-        _recipe("SmallVisdomGs", visdom_gs, SMALL_SPLATS | {"vd": RegularizerConfig(enabled=True, bank=4)})
-    )
-    found += _field_presets("SmallIngp", "visdom_plugin.methods.fields.ingp:Ingp", ingp, **SMALL_INGP)
-    found.append(_recipe("SmallVisdomField", visdom_field, SMALL_INGP))
-    grid = SMALL_INGP["grid"]
-    found += _field_presets(
-        "SmallZipNerf",
-        "visdom_plugin.methods.fields.zipnerf_lite:ZipNerfLite",
-        zipnerf_lite,
-        steps=40,
-        rays=128,
-        samples=(12, 12, 8),
-        test_samples=(12, 12, 8),
-        density_bias=-2.0,
-        coarse_grid=replace(grid, levels=3, features=1),
-        fine_grid=replace(grid, levels=3, features=1),
-        grid=replace(grid, features=4),
-    )
-    found += _field_presets(
-        "SmallZeroRf",
-        "visdom_plugin.methods.fields.zerorf_lite:ZeroRfLite",
-        zerorf_lite,
-        steps=40,
-        first_rays=128,
-        rays=256,
-        step_length=0.06,
-        missing_step_length=0.3,
-        noise_resolution=2,
-        width=4,
-        occupancy_resolution=32,
-    )
-    return found
+    return found + built_in()
 
 
 METHODS = _methods()
-WHOLE = (
-    "SmallField",
-    "SmallGsGo",
-    "SmallCorgs",
-    "SmallFsgs",
-    "SmallVisdomGs",
-    "SmallIngp",
-    "SmallVisdomField",
-    "SmallZipNerf",
-    "SmallZeroRf",
-)
-"""Those that break nothing: the example and the built-in methods, small."""

@@ -14,7 +14,8 @@ ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "my_method"
 sys.path.insert(0, str(EXAMPLE))
 try:
-    from tests.conformance.broken import BROKEN, WHOLE
+    from tests.conformance.broken import BROKEN
+    from tests.conformance.whole import WHOLE
 finally:
     sys.path.remove(str(EXAMPLE))
 
