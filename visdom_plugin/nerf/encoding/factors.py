@@ -64,7 +64,7 @@ class PlanesTimesLines(Factors):
             # Of a line, which is a plane of one column, the first coordinate says nothing.
             on_line = torch.stack([torch.zeros_like(points[:, axis]), points[:, axis]], -1)
             features.append(_sample(plane, points[:, axes]) * _sample(line, on_line))
-        return torch.cat(features, -1)
+        return torch.cat(features).T
 
 
 class TwoVolumes(Factors):
@@ -99,15 +99,11 @@ class TwoVolumes(Factors):
 
     def look_up(self, points: Tensor, made: list[Tensor]) -> Tensor:
         repeated = points.remainder(self.period) * (2 / self.period) - 1
-        return torch.cat([_sample(made[0], points), _sample(made[1], repeated)], -1)
+        return torch.cat([_sample(made[0], points), _sample(made[1], repeated)]).T
 
 
 def _sample(tensor: Tensor, points: Tensor) -> Tensor:
-    """(m, C) linear interpolation of a tensor (1, C, ..., h, w) at points (m, d) in [-1, 1], last axis first."""
+    """(C, m) linear interpolation of a tensor (1, C, ..., h, w) at points (m, d) in [-1, 1], last axis first."""
     at = points.reshape(1, *(1,) * (points.shape[-1] - 1), *points.shape)
-    return (
-        grid_sample(tensor, at, padding_mode="border", align_corners=False)
-        .flatten(1)[0]
-        .reshape(tensor.shape[1], -1)
-        .T
-    )
+    found = grid_sample(tensor, at, padding_mode="border", align_corners=False)
+    return found.reshape(tensor.shape[1], len(points))
