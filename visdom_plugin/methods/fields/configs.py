@@ -294,7 +294,6 @@ class ZeroRfConfig(FieldConfig):
             "first_rays",
             "rays",
             "noise_channels",
-            "noise_resolution",
             "channels",
             "width",
             "hidden",
@@ -307,7 +306,6 @@ class ZeroRfConfig(FieldConfig):
             "fit_margin",
             "weight_decay",
             "occupancy_density",
-            "test_occupancy_density",
         )
         first, second = self.rays_grow_at
         demand(
@@ -316,6 +314,11 @@ class ZeroRfConfig(FieldConfig):
             | {name: (getattr(self, name) >= 1, "1 or more") for name in counts}
             | {name: (getattr(self, name) >= 0, "0 or more") for name in least_0}
             | {
+                "test_occupancy_density": (
+                    0 <= self.test_occupancy_density <= self.occupancy_density,
+                    f"0 or more, at most occupancy_density, {self.occupancy_density}",
+                ),
+                "noise_resolution": (self.noise_resolution >= 2, "2 or more"),
                 "rays_grow_at": (0 <= first <= second, "two steps, the second not before the first"),
                 "cull_weight": (0 <= self.cull_weight < 1, "a share from 0 to below 1"),
                 "view_degree": (0 <= self.view_degree <= 4, "0 to 4"),

@@ -90,7 +90,7 @@ class MarchedField(RadianceField[Config]):
         rays = self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
         step_length = torch.where(rays.hit, c.step_length, c.missing_step_length)
         shift = uniform(draw, self.device, n)
-        samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks)
+        samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks, self.occupancy)
         rgb, alpha, _ = self._shade(rays, samples, background)
         rgb = self.correct(rgb, alpha, background, batch.pixels)
         return Drawn(rgb, alpha, photograph_on(background, batch, alpha), len(samples.ray))
@@ -100,7 +100,7 @@ class MarchedField(RadianceField[Config]):
     ) -> Tensor:
         step_length = torch.full_like(rays.far, self.config.missing_step_length)
         shift = uniform(generator, self.device, len(rays.far))
-        samples = self._take_samples(rays, rays.far, step_length, shift, [])
+        samples = self._take_samples(rays, rays.far, step_length, shift, [], self.occupancy)
         alpha = self._shade(rays, samples, rays.origins.new_ones(len(rays.far), 3))[1]
         return mask_loss(alpha, torch.zeros_like(alpha))
 
@@ -111,7 +111,8 @@ class MarchedField(RadianceField[Config]):
         rays = self.bound(origins, directions, hooks)
         far = torch.where(rays.hit, rays.far, rays.near)
         step_length = torch.full_like(far, self.config.step_length)
-        samples = self._take_samples(rays, far, step_length, torch.zeros_like(far), hooks)
+        grid = self.occupancy_of_renders()
+        samples = self._take_samples(rays, far, step_length, torch.zeros_like(far), hooks, grid)
         return self._shade(rays, samples, background.expand(len(far), 3))
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -131,10 +132,12 @@ class MarchedField(RadianceField[Config]):
     def mesh(self, resolution: int = MESH_RESOLUTION) -> FieldMesh | None:
         """The surface in the capture's frame; see `mesh_density`."""
 
+        grid = self.occupancy_of_renders()
+
         def density_of(points: Tensor) -> Tensor:
             # What rendering skips is not there.
             points = points.to(self.device)
-            there = self.occupancy.is_occupied(points)
+            there = grid.is_occupied(points)
             for hook in sample_filters(self.hooks_at_inference()):
                 there &= hook.keep(self.frame.to_world(points))
             return torch.where(there, self.density(points), 0)
@@ -156,12 +159,20 @@ class MarchedField(RadianceField[Config]):
         _, features = self._features(points.to(self.device))
         return self._look(features, self._encode_views(directions.to(self.device)))
 
+    def occupancy_of_renders(self) -> OccupancyGrid:
+        """The grid through which novel views are marched, and outside of which the mesh has nothing."""
+        return self.occupancy
+
     def _take_samples(
-        self, rays: LocalRays, far: Tensor, step_length: Tensor, shift: Tensor, hooks: Sequence[SamplerHook]
+        self,
+        rays: LocalRays,
+        far: Tensor,
+        step_length: Tensor,
+        shift: Tensor,
+        hooks: Sequence[SamplerHook],
+        grid: OccupancyGrid,
     ) -> PackedSamples:
-        samples = march_occupied(
-            rays.origins, rays.directions, rays.near, far, step_length, shift, self.occupancy
-        )
+        samples = march_occupied(rays.origins, rays.directions, rays.near, far, step_length, shift, grid)
         for hook in sample_filters(hooks):
             samples = select(samples, hook.keep(self.frame.to_world(points_of(rays, samples))))
         return samples

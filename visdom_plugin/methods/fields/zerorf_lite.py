@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import torch
 from torch import Generator, Tensor, nn
@@ -14,7 +15,13 @@ from visdom_plugin.errors import VisDomError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hooks.protocols import SamplerHook
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.methods.fields.common import LocalRays, psnr_of, silhouette_loss
+from visdom_plugin.methods.fields.common import (
+    MESH_RESOLUTION,
+    FieldMesh,
+    LocalRays,
+    psnr_of,
+    silhouette_loss,
+)
 from visdom_plugin.methods.fields.configs import ZeroRfConfig
 from visdom_plugin.methods.fields.marched import MarchedField, points_of
 from visdom_plugin.nerf.encoding.factors import Factors, PlanesTimesLines, TwoVolumes
@@ -121,10 +128,24 @@ class ZeroRfLite(MarchedField[ZeroRfConfig]):
         with self._make_once():
             return super().render(camera, background)
 
+    def mesh(self, resolution: int = MESH_RESOLUTION) -> FieldMesh | None:
+        """The surface in the capture's frame; see `mesh_density`."""
+        with torch.no_grad(), self._make_once():
+            return super().mesh(resolution)
+
+    def occupancy_of_renders(self) -> OccupancyGrid:
+        return self.occupancy.loosened(self.config.test_occupancy_density)
+
     def _take_samples(
-        self, rays: LocalRays, far: Tensor, step_length: Tensor, shift: Tensor, hooks: Sequence[SamplerHook]
+        self,
+        rays: LocalRays,
+        far: Tensor,
+        step_length: Tensor,
+        shift: Tensor,
+        hooks: Sequence[SamplerHook],
+        grid: OccupancyGrid,
     ) -> PackedSamples:
-        samples = super()._take_samples(rays, far, step_length, shift, hooks)
+        samples = super()._take_samples(rays, far, step_length, shift, hooks, grid)
         if not self.config.cull_weight or not torch.is_grad_enabled():
             return samples
         with torch.no_grad():
@@ -164,8 +185,9 @@ def fit_cube(views: Views, margin: float) -> Frame:
     Args:
         margin: room around the object, as a share of its half side.
     """
+    fit = replace(FIT, k=min(3, len(views)))
     try:
-        low, high = (torch.as_tensor(x) for x in FIT.carve(*views.silhouettes()).extent)
+        low, high = (torch.as_tensor(x) for x in fit.carve(*views.silhouettes()).extent)
     except VisDomError as error:
         frame = frame_of(views.cameras)
         log.warning(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -93,10 +94,15 @@ class OccupancyGrid:
         self.density *= self.decay
         # The same cell may be drawn twice: the larger density counts, whatever the order.
         self.density.scatter_reduce_(0, cells, found, "amax")
-        self.occupied = self.above(self.threshold)
+        self.occupied = self._above(self.threshold)
 
-    def above(self, threshold: float) -> Tensor:
-        """(resolution, resolution, resolution) bool, the cells whose remembered density is above a threshold."""
+    def loosened(self, threshold: float) -> OccupancyGrid:
+        """This grid with the cells above a smaller threshold, too, to march through; the density is shared."""
+        grid = copy.copy(self)
+        grid.threshold, grid.occupied = threshold, self.occupied | self._above(threshold)
+        return grid
+
+    def _above(self, threshold: float) -> Tensor:
         limit = self.density.double().mean().clamp_max(threshold)
         return (self.density > limit).reshape(self.reachable.shape) & self.reachable
 
