@@ -60,7 +60,10 @@ def choose_files(capture: Capture, request: Request) -> Chosen:
     """
     if not capture.frames:
         raise SceneError(
-            "the scene has no photographs", where=capture.root, cause="a scene that was copied only in part"
+            "the scene has no photographs",
+            where=capture.root,
+            cause="the file of poses lists none, or was copied only in part",
+            todo="copy or export the poses again",
         )
     _check_names(capture, request)
     names = [frame.name for frame in capture.frames]

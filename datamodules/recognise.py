@@ -68,6 +68,8 @@ _ELSEWHERE = {
 
 
 _MOST_FOLDERS, _PEEKED = 200, 1 << 16
+_PACKED = (".zip", ".7z", ".rar", ".gz", ".tgz", ".tar", ".xz")
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 
 
 def load(
@@ -246,6 +248,16 @@ def _guess(root: Path) -> str:
         with path.open("rb") as file:
             if b'"frames"' in file.read(_PEEKED):
                 return f"{path.name} lists frames as a transforms.json does: rename it to transforms.json"
+    if (root / "images").is_dir() or any(p.suffix.lower() in ENDINGS for p in root.iterdir()):
+        return "photographs without poses: `visdom-prepare PHOTOS --out SCENE` finds poses and masks"
+    for path in sorted(root.iterdir()):
+        if path.suffix.lower() in _PACKED:
+            return f"{path.name} is not unpacked"
+        if path.suffix.lower() in _VIDEOS:
+            return (
+                f"{path.name} is a video: save some sharp frames of it as photographs, and "
+                "`visdom-prepare PHOTOS --out SCENE` finds their poses"
+            )
     return (
         "it holds none of the files that the layouts are known by" if any(root.iterdir()) else "it is empty"
     )

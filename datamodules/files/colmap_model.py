@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import torch
 
-from datamodules.files.parsers import damaged
+from datamodules.files.parsers import blame_commas, damaged, decode_text
 from datamodules.files.paths import inside, read_inside
 from datamodules.files.pinholes import pinholes
 from datamodules.files.undistort import COEFFICIENTS, Distortion, advise_undistorting
@@ -241,11 +241,8 @@ def _add(table: dict[int, _T], key: int, value: _T, path: Path) -> None:
 
 
 def text_lines(data: bytes, path: Path) -> list[str]:
-    """The lines of a text file in UTF-8, with or without a byte order mark."""
-    try:
-        return data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        damaged(path, f"{path.name} is not text in UTF-8", cause="a binary or damaged file named .txt")
+    """The lines of a text file in UTF-8 (or UTF-16 with its mark)."""
+    return decode_text(data, path, "a binary or damaged file named .txt").splitlines()
 
 
 def parse_cameras_text(data: bytes, path: Path) -> dict[int, Intrinsics]:
@@ -260,7 +257,8 @@ def parse_cameras_text(data: bytes, path: Path) -> dict[int, Intrinsics]:
             camera_id, model, width, height = int(fields[0]), fields[1], int(fields[2]), int(fields[3])
             params = tuple(map(float, fields[4:]))
         except (IndexError, ValueError):
-            damaged(path, f"line {number} is not `ID MODEL WIDTH HEIGHT PARAMS...`: {line.strip()[:80]!r}")
+            what = f"line {number} is not `ID MODEL WIDTH HEIGHT PARAMS...`: {line.strip()[:80]!r}"
+            damaged(path, what, *(blame_commas(line) or ()))
         if model in known and len(params) != known[model]:
             damaged(path, f"line {number}: {model} needs {known[model]} parameters, {len(params)} given")
         _add(cameras, camera_id, Intrinsics(model, width, height, params), path)
@@ -285,11 +283,9 @@ def parse_images_text(data: bytes, path: Path) -> list[Registered]:
             image_id, camera_id, name = int(fields[0]), int(fields[8]), fields[9]
             qw, qx, qy, qz, tx, ty, tz = map(float, fields[1:8])
         except (IndexError, ValueError):
-            damaged(
-                path,
-                f"line {number} is not `ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`: {line.strip()[:80]!r}",
-                cause="a damaged file, or the second line of an image (its points, often empty) was removed",
-            )
+            what = f"line {number} is not `ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`: {line.strip()[:80]!r}"
+            lost = "a damaged file, or the second line of an image (its points, often empty) was removed"
+            damaged(path, what, *(blame_commas(line) or (lost,)))
         if at < len(lines):
             number, points = lines[at]
             at += 1

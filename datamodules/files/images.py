@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from importlib import import_module
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import NamedTuple, NoReturn
 
 import numpy as np
@@ -20,6 +20,7 @@ from visdom_plugin.errors import SceneError
 MAX_PIXELS = 2**28
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".heic", ".heif")
 """Of the files of these formats, in lower case; PNG first, as masks are looked for in this order."""
+_CLUTTER = ("@eaDir", "__MACOSX")
 _MARKS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
 """How files end of the formats that OpenCV decodes; it fills what is missing with grey and says nothing."""
 _LOSSLESS = ("PNG", "TIFF", "BMP")
@@ -46,6 +47,15 @@ class Header(NamedTuple):
     """EXIF's tag, 1 to 8: how a viewer turns the stored pixels. TIFF is decoded upright, so it has 1."""
 
 
+def is_image_name(relative: PurePath) -> bool:
+    """Whether a path below a scene's folder is called like an image.
+
+    What systems leave beside images is called alike: ._v01.png of macOS, thumbnails in @eaDir, .hidden files.
+    """
+    parts = relative.parts
+    return relative.suffix.lower() in ENDINGS and not any(p[0] == "." or p in _CLUTTER for p in parts)
+
+
 def read_header(data: bytes, path: Path) -> Header:
     """The header of a complete image file; no pixel is decoded.
 
@@ -58,14 +68,17 @@ def read_header(data: bytes, path: Path) -> Header:
         complete = kind not in _MARKS or data.rfind(_MARKS[kind]) >= end
         if kind == "PNG":
             image.verify()  # walks the chunks to the last one and compares their checksums
-        exif = Image.Image.getexif(image) if kind != "TIFF" else {}  # PngImageFile's own would decode
-        orientation = exif.get(_ORIENTATION, 1)
     except SceneError:
         raise
     except Exception as error:  # Pillow raises whatever it comes across
         _damaged(path, f"the {kind} is damaged, or stops before its end: {str(error)[:120]}")
     if not complete:
         _damaged(path, f"the {kind} stops before its end")
+    try:
+        exif = Image.Image.getexif(image) if kind != "TIFF" else {}  # PngImageFile's own would decode
+        orientation = exif.get(_ORIENTATION, 1)
+    except Exception:  # EXIF data that nothing reads turns no viewer's picture either
+        orientation = 1
     width, height = image.size
     most = MAX_PIXELS
     # Deflate makes at most 1032 bytes of one, and a JPEG's block of 8 x 8 pixels takes at least one bit: a
@@ -253,8 +266,10 @@ def _kind(data: bytes, path: Path) -> str:
     ):
         if fits:
             return kind
+    if not data:
+        _damaged(path, "the file is empty")
     raise SceneError(
-        f"the file is none of {', '.join(_PLUGINS)}" if data else "the file is empty",
+        f"the file is none of {', '.join(_PLUGINS)}",
         where=path,
         cause="another format behind this extension, or an interrupted copy",
         todo="convert it to PNG or JPEG, or copy it again",

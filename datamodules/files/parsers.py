@@ -5,6 +5,7 @@ Each parser takes the bytes and costs memory in proportion to them, whatever the
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import json
@@ -17,6 +18,8 @@ import numpy as np
 
 from visdom_plugin.errors import SceneError
 
+_COMMAS = "a decimal comma, as programs write it where the system's language does"
+
 
 def damaged(
     path: Path,
@@ -26,6 +29,26 @@ def damaged(
 ) -> NoReturn:
     """Raises SceneError about a file."""
     raise SceneError(what, where=path, cause=cause, todo=todo)
+
+
+def decode_text(
+    data: bytes,
+    path: Path,
+    cause: str = "text in another encoding, or a damaged file",
+    todo: str = "save it as UTF-8, or copy it again",
+) -> str:
+    """The text of a file in UTF-8, or in UTF-16 where it begins with the mark of that (Windows' "Unicode").
+
+    Raises:
+        SceneError: it is neither; with the cause and what to do as they are given.
+    """
+    # Numbers and names begin with ASCII, of which one byte of two is zero.
+    wide = {codecs.BOM_UTF16_LE: data[3:4], codecs.BOM_UTF16_BE: data[2:3]}.get(data[:2]) == b"\0"
+    encoding = "utf-16" if wide else "utf-8-sig"
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError:
+        damaged(path, f"{path.name} is not text in UTF-8", cause, todo)
 
 
 def parse_json(data: bytes, path: Path) -> dict[str, Any]:
@@ -39,20 +62,36 @@ def parse_json(data: bytes, path: Path) -> dict[str, Any]:
         # Python's own conversion is quadratic in the digits, or refuses them.
         return int(text) if len(text) < 19 else float(text)
 
+    text = decode_text(data, path)
     try:
-        content = json.loads(data.decode("utf-8-sig"), parse_int=integer)
-    except UnicodeDecodeError:
-        damaged(path, f"{path.name} is not text in UTF-8")
+        content = json.loads(text, parse_int=integer)
     except RecursionError:
         damaged(path, f"{path.name} is nested too deeply", cause="a damaged or malicious file")
-    except ValueError as error:
-        damaged(path, f"{path.name} is not JSON: {str(error)[:200]}")
+    except json.JSONDecodeError as error:
+        what = f"{path.name} is not JSON: {str(error)[:200]}" if text.strip() else f"{path.name} is empty"
+        damaged(path, what, *_explain_json(text, error))
     if not isinstance(content, dict):
         what = f"{path.name} holds a {type(content).__name__} at the top, not an object"
         damaged(
             path, what, "another program's form of the file", "write {...} at the top, with the format's keys"
         )
     return content
+
+
+def _explain_json(text: str, error: json.JSONDecodeError) -> tuple[str, str] | tuple[()]:
+    """Cause and what to do of what people and other programs write that is no JSON; nothing for the rest."""
+    before, rest = text[: error.pos].rstrip(), text[error.pos :].lstrip()
+    if rest.startswith(("//", "/*", "#")):
+        return "a comment, which JSON does not have", "remove all comments"
+    if rest.startswith("'"):
+        return "single quotes, as Python prints a dictionary", "write the file with json.dump"
+    # Python 3.13 points at the comma, its predecessors at what follows.
+    after = rest[1:].lstrip() if rest.startswith(",") else rest if before.endswith(",") else ""
+    if after.startswith(("]", "}")):
+        return "a comma behind the last of several entries", "remove this comma"
+    if before.endswith(",") and rest[:1].isdigit() and before[-2:-1].isdigit():
+        return _COMMAS, "write the number with a point"
+    return ()
 
 
 def number(value: Any, what: str, path: Path) -> float:
@@ -66,6 +105,8 @@ def number(value: Any, what: str, path: Path) -> float:
     ):
         todo = f"write it without quotes: {value.strip():.30}"
         damaged(path, f"{what} is a text, {value[:40]!r}, not a number", "a number in quotes", todo)
+    if isinstance(value, str) and (todo := _with_point(value)):
+        damaged(path, f"{what} is {value.strip()!r}, not a number", _COMMAS, todo)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         damaged(
             path, f"{what} is {_shown(value)}, not a finite number", cause="a damaged or wrongly written file"
@@ -108,13 +149,17 @@ def parse_csv(data: bytes, path: Path, columns: tuple[str, ...]) -> list[dict[st
         SceneError: not UTF-8, without one of the columns, or with a row of another length.
     """
     try:
-        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+        reader = csv.reader(io.StringIO(decode_text(data, path), newline=""), strict=True)
         header = [name.strip() for name in next(reader, [])]
         missing = [name for name in columns if name not in header]
         if missing:
-            damaged(
-                path, f"{path.name} has no column {', '.join(missing)}", cause="another file of this name"
+            what, mark = (
+                f"{path.name} has no column {', '.join(missing)}",
+                next((m for m in ";\t" if len(header) == 1 and m in header[0]), None),
             )
+            if mark is not None:
+                damaged(path, what, f"values parted by {mark!r}", "save the table with commas between values")
+            damaged(path, what, cause="another file of this name")
         where = {name: header.index(name) for name in columns}
         rows = []
         for row in reader:
@@ -123,8 +168,6 @@ def parse_csv(data: bytes, path: Path, columns: tuple[str, ...]) -> list[dict[st
             if len(row) != len(header):
                 damaged(path, f"line {reader.line_num} has {len(row)} values, the header {len(header)}")
             rows.append({name: row[i].strip() for name, i in where.items()})
-    except UnicodeDecodeError:
-        damaged(path, f"{path.name} is not text in UTF-8")
     except csv.Error as error:
         damaged(path, f"{path.name} is not a table of comma separated values: {error}")
     return rows
@@ -137,7 +180,9 @@ def csv_number(row: dict[str, str], column: str, path: Path) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        damaged(path, f"{column} is {row[column][:40]!r}, not a finite number")
+        what = f"{column} is {row[column][:40]!r}, not a finite number"
+        todo = _with_point(row[column])
+        damaged(path, what, _COMMAS, todo) if todo else damaged(path, what)
     return value
 
 
@@ -166,6 +211,18 @@ def parse_npy(data: bytes, path: Path) -> np.ndarray:
     if math.prod(shape) * dtype.itemsize != len(data) - end:
         damaged(path, f"{path.name} declares an array of {shape} {dtype} and holds {len(data) - end} bytes")
     return np.frombuffer(data, dtype, offset=end).reshape(shape, order="F" if fortran else "C")
+
+
+def blame_commas(line: str) -> tuple[str, str] | None:
+    """Cause and what to do of a line of numbers with decimal commas; None of any other line."""
+    words = line.split()
+    return (_COMMAS, "write all numbers with points") if any(map(_with_point, words)) else None
+
+
+def _with_point(text: str) -> str | None:
+    """What to do about a number with a decimal comma; None of any other text."""
+    fits = re.fullmatch(r"\s*[-+]?\d+,\d+(e[-+]?\d+)?\s*", text[:60], re.ASCII | re.IGNORECASE)
+    return f"write it with a point: {text.strip().replace(',', '.')}" if fits else None
 
 
 def _shown(value: Any) -> str:

@@ -10,12 +10,12 @@ masks/             foreground masks named after the photographs; or alpha channe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 
 from datamodules.capture import Calibration, Capture, Frame, sort_frames
-from datamodules.files.images import ENDINGS
+from datamodules.files.images import is_image_name
 from datamodules.files.parsers import damaged, parse_npy
 from datamodules.files.paths import check_name, inside, read_inside
 from datamodules.files.pinholes import pinholes
@@ -114,7 +114,7 @@ def _list_photographs(root: Path, request: Request) -> list[str]:
     for name in folders:
         folder = inside(root, name, outside=request.allow_outside)
         if folder.is_dir():
-            found = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in ENDINGS)
+            found = sorted(p.name for p in folder.iterdir() if is_image_name(PurePath(p.name)))
             for file in found:
                 check_name(file, folder)
             return found

@@ -12,7 +12,7 @@ import io
 import re
 import zipfile
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 
@@ -152,7 +152,9 @@ def decompose(matrix: np.ndarray, name: str, path: Path) -> tuple[list[float], n
 def _list_images(root: Path, folder: str, request: Request) -> list[str]:
     path = inside(root, folder, outside=request.allow_outside)
     found = (
-        sorted(p.name for p in path.iterdir() if p.suffix.lower() in images.ENDINGS) if path.is_dir() else []
+        sorted(p.name for p in path.iterdir() if images.is_image_name(PurePath(p.name)))
+        if path.is_dir()
+        else []
     )
     for name in found:
         check_name(name, path)

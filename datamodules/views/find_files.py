@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
-from datamodules.files.images import ENDINGS
+from datamodules.files.images import ENDINGS, is_image_name
 
 log = logging.getLogger(__name__)
 
@@ -50,16 +50,17 @@ class ImageFiles:
             if count > _MOST_FILES:
                 break
             for file in files:
-                if file.lower().endswith(ENDINGS):
-                    found[loose_key(file)].append(Path(folder, file).relative_to(self.root).as_posix())
+                path = Path(folder, file).relative_to(self.root)
+                if is_image_name(path):
+                    found[loose_key(file)].append(path.as_posix())
         return found
 
     def find(self, name: str, *, anywhere: bool = True) -> str | None:
         """The one file that a name can mean, or the name itself where there is such a file; else None.
 
         The ending, the case, the Unicode form and leading folders may differ. Of several candidates, the one that
-        shares most of the last folders counts; folders of masks, depths and smaller copies hold no photographs
-        unless the name says so.
+        shares most of the last folders counts, of several there the one with the name's own ending; folders of
+        masks, depths and smaller copies hold no photographs unless the name says so.
 
         Args:
             anywhere: False looks in the folder alone that the name gives.
@@ -77,6 +78,10 @@ class ImageFiles:
                     common += 1
                 shared[common].append(file)
         best = shared[max(shared)] if shared else []
+        # v01.JPG is nearer to v01.jpg than v01.png is, which may be a cut-out or a preview of it.
+        ending = PurePosixPath(name).suffix.lower()
+        if len(best) > 1:
+            best = [file for file in best if PurePosixPath(file).suffix.lower() == ending]
         return best[0] if len(best) == 1 else None
 
 

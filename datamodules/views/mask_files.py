@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from datamodules.capture import Capture
-from datamodules.files.images import ENDINGS
+from datamodules.files.images import ENDINGS, is_image_name
 from datamodules.files.paths import inside, printable, stem
 from datamodules.request import Request
 from datamodules.views.find_files import loose_key
@@ -86,15 +86,22 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> M
     shift = 0 if any(affix) else _find_shift((name for names in photographs for name in names), there)
     if (missing or shift) and not request.allow_missing_masks:
         missing = missing or [i for i in range(len(photographs)) if i not in found]
-        hint = f"there are masks that no image has: {list_some(extra)}" if extra else _strange_files(path)
+        hint = f"there are masks that no image has: {list_some(extra)}" if extra else None
         reason = f"the masks' numbers are shifted by {shift}" if shift else "masks named otherwise"
         looked = " or ".join(f"{folder}/{printable(stem(name))}.png" for name in photographs[missing[0]])
+        todo = f"name each mask like its image, such as {looked}"
+        cause = f"{reason}; {hint}" if hint else None
+        if cause is None and (strange := _strange_files(path)):
+            cause = f"it holds {list_some(map(printable, strange), 3)}, which are read as no image"
+            todo = f"save masks as PNG, each named like its image, such as {looked}"
+        # Where no view has a mask there is nothing to carve the others' from.
+        if found or named.keys() - set(open_ones):
+            todo += "; or say what becomes of views without: --data.missing-masks colour|hull"
         raise SceneError(
             f"{len(missing)} of the images have no mask: {list_some([stem(photographs[i][0]) for i in missing])}",
             where=path,
-            cause=f"{reason}; {hint}" if hint else None,
-            todo=f"name each mask like its image, such as {looked}; or say what becomes of views without: "
-            "--data.missing-masks colour|hull",
+            cause=cause,
+            todo=todo,
         )
     if shift:
         log.warning("%s: the masks look shifted by %d against the photographs' numbers", path, shift)
@@ -160,7 +167,8 @@ def _find_folder(
 
 
 def _image_files(path: Path) -> set[str]:
-    return {file.relative_to(path).as_posix() for file in path.rglob("*") if file.suffix.lower() in ENDINGS}
+    below = (file.relative_to(path) for file in path.rglob("*"))
+    return {file.as_posix() for file in below if is_image_name(file)}
 
 
 def _match(
@@ -189,6 +197,12 @@ def _match(
 
     found = {i: hits for i, names in enumerate(photographs) if (hits := look_up(names))}
     if files and photographs and not found:
+        # masks/images/v01.png: the folder of photographs was masked as a whole.
+        folder = os.path.commonpath([PurePosixPath(file).parent for file in files])
+        if folder:
+            below, affix = _match(photographs, {file.removeprefix(f"{folder}/") for file in files})
+            if below:
+                return {i: [f"{folder}/{file}" for file in hits] for i, hits in below.items()}, affix
         # Tools add the same to every name: cup-removebg-preview, mask_cup, cup.mask.
         name = PurePosixPath(stem(photographs[0][0])).name
         for file in sorted(files):
@@ -204,12 +218,10 @@ def _fold(start: str) -> str:
     return loose_key(f"{start}.png")
 
 
-def _strange_files(path: Path) -> str | None:
-    """What lies in a folder of masks that is no image."""
-    strange = sorted(p.name for p in path.iterdir() if p.is_file() and p.suffix.lower() not in ENDINGS)
-    return (
-        f"it holds {list_some(map(printable, strange), 3)}, which are read as no image" if strange else None
-    )
+def _strange_files(path: Path) -> list[str]:
+    """What lies in a folder of masks that is no image, by name."""
+    found = (p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
+    return sorted(p.name for p in found if p.suffix.lower() not in ENDINGS)
 
 
 def looks_inverted(mask: Tensor) -> bool:

@@ -173,6 +173,28 @@ class ViewReader:
 
 
 def map_on_cores(function: Callable[[int], _T], positions: Sequence[int]) -> list[_T]:
-    """`function` of each position, on all cores; the first (in the given order) error is raised."""
+    """`function` of each position, on all cores.
+
+    Raises:
+        SceneError: the first (in the given order) that it raises, with the number of those that are alike.
+    """
+
+    def attempt(position: int) -> _T | SceneError:
+        try:
+            return function(position)
+        except SceneError as error:
+            return error
+
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        return list(pool.map(function, positions))
+        results = list(pool.map(attempt, positions))
+    errors = [result for result in results if isinstance(result, SceneError)]
+    if errors:
+        alike = sum(error.what == errors[0].what for error in errors) - 1
+        first = errors[0]
+        if alike:
+            others = "another view" if alike == 1 else f"{alike} other views"
+            raise SceneError(
+                f"{first.what}; the same of {others}", where=first.where, cause=first.cause, todo=first.todo
+            )
+        raise first
+    return [result for result in results if not isinstance(result, SceneError)]

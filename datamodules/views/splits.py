@@ -219,7 +219,7 @@ def parse_positions(data: bytes, count: int, path: Path) -> list[int]:
         SceneError: for anything but at least one integer in [0, count), none of them twice.
     """
     name = path.name
-    words = data.decode("utf-8-sig", errors="replace").split()
+    words = data.decode("utf-8-sig", errors="replace").replace(",", " ").split()
     for word in words:
         if not is_integer(word):
             raise SceneError(

@@ -117,6 +117,13 @@ class VisibleDomain(HullSettings):
                 "larger k or explicit bounds would close it",
                 *hull.bounds.round(4).tolist(),
             )
+        if strays := hull.summary.get("components_strays"):
+            log.warning(
+                "%d of %d pieces explain no mask: where the other views have unknown pixels, two views that agree "
+                "by chance keep them; components=explain, the default, drops such pieces",
+                strays,
+                hull.summary["components"],
+            )
         known = silhouettes.demanding()
         inverted = [i for i in range(len(known)) if look_inverted(known.mask(i), silhouettes.unknown_in(i))]
         if 2 * len(inverted) > len(silhouettes):

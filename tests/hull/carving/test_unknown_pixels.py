@@ -116,3 +116,18 @@ def test_silhouettes_hold_them_apart(capture):
     assert not packed.unknown_in(1).any() and np.array_equal(packed.demanding().mask(1), masks[1].numpy())
     grown = gather_silhouettes(*views.silhouettes(), dilate_px=1)
     assert not grown.mask(0)[18, 18] or masks[0][17:20, 17:20].any()
+
+
+def test_pieces_that_explain_nothing_are_told_where_all_are_kept(caplog):
+    """Two views of two balls leave phantoms, which the other views rule out unless they know nothing there."""
+    cameras = ring(6, size=64)
+    masks = ball_masks(cameras, [((-0.6, 0.1, 0), 0.2), ((0.6, 0, 0), 0.2)])
+    unknown = [torch.zeros_like(m) if i < 2 else ~m for i, m in enumerate(masks)]
+    domain = VisibleDomain(resolution=48, components="all", k=2, bounds=((-2,) * 3, (2,) * 3))
+    strays = domain.carve(cameras, masks, unknown).summary["components_strays"]
+    assert strays == domain.carve(cameras, masks, unknown).summary["components"] - 2 > 0
+    assert f"{strays} of {strays + 2} pieces explain no mask" in caplog.text
+    assert "components=explain" in caplog.text
+    caplog.clear()
+    assert "components_strays" not in domain.carve(cameras, masks).summary
+    assert "explain no mask" not in caplog.text

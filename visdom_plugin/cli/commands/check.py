@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -25,7 +25,7 @@ FOUND = 1
 """Exit status with findings."""
 
 
-GEOMETRY = {"axes", "centres", "disagreement", "order", "principal", "scale", "swapped", "view"}
+GEOMETRY = {"axes", "centres", "disagreement", "order", "principal", "scale", "swapped", "turned", "view"}
 """Kinds of findings by which masks and cameras do not fit each other, whatever K is."""
 
 
@@ -73,6 +73,11 @@ def _main(argv: Sequence[str]) -> int:
     loaded = time.perf_counter()
     k = None if options.k == "auto" else options.k
     found = check_views(views, masks, k=k, layout=scene.source.get("layout"))
+    if len(views) < min(2, len(scene.train)):
+        count = len(scene.train) - len(views)
+        todo = f"make masks for the other {count} views, or name views that have one with --train-list"
+        made = [f._replace(todo=todo) if f.kind == "few" else f for f in found.findings]
+        found = replace(found, findings=made)
     report = {"scene": scene.name, **describe_check(found, views.names, inverted=options.invert_masks)}
     report["seconds"] = {
         "load": round(loaded - started, 3),

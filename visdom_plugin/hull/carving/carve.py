@@ -82,6 +82,10 @@ def carve_silhouettes(
         "seconds": round(ended - located + summed - started, 4),
         "bounds_seconds": round(located - summed, 4),
     }
+    unknown = any(silhouettes.unknown_in(i) is not None for i in range(len(silhouettes)))
+    if policy == "all" and unknown:
+        explaining = explaining_pieces(pieces, occupancy, grid, silhouettes, rule, search.areas)
+        summary["components_strays"] = int(np.count_nonzero(~explaining))
     if ball is not None:
         summary |= {"sphere_centre": [float(x) for x in ball[0]], "sphere_radius": float(ball[1])}
     return Hull(occupancy, grid.bounds, summary)

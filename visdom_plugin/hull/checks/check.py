@@ -135,7 +135,7 @@ def check(
         found.append(_disagreement(fit, usable[left], names))
     rest = outlines.keep(left)
     advice = None
-    if left.sum() >= 2 and not any(c.kind in ("axes", "scale", "order", "swapped") for c in causes):
+    if left.sum() >= 2 and not any(c.kind in ("axes", "scale", "turned", "order", "swapped") for c in causes):
         kept = Name([names[i] for i in usable[left]])
         advice = advise_k(rest, kept, fit, USUAL_K if k is None else k)
         # Views that do not fit each other seem to have little in common at any K.
@@ -277,6 +277,8 @@ _TODO = {
     "scale": "scale the intrinsics with the images: a photograph resized by s has s times the focal length and "
     "principal point",
     "order": "check how images, masks and poses are matched: sort them by the same key",
+    "turned": "turn photographs and masks back: the poses were estimated from them the other way round, as a "
+    "viewer shows them that follows EXIF's orientation",
     "swapped": "exchange them back, photographs and masks, or their poses",
     "view": "look at this view's mask and pose, or leave it out",
 }

@@ -14,8 +14,8 @@ class Finding(NamedTuple):
     """One thing that is wrong, or worth knowing."""
 
     kind: str
-    """Machine-readable name: size, empty, full, border, speckled, inverted, duplicate, axes, order, swapped,
-    scale, principal, centres, view, disagreement, clustered, covisibility, few."""
+    """Machine-readable name: size, empty, full, border, speckled, inverted, duplicate, axes, order, turned,
+    swapped, scale, principal, centres, view, disagreement, clustered, covisibility, few."""
     what: str
     """A sentence with the number behind it."""
     views: tuple[int, ...]

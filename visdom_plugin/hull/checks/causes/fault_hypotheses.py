@@ -29,7 +29,7 @@ _MOST_RAYS, _TRIAL_RAYS, _BRIEF_RAYS = 1536, 512, 768
 _ALL_PAIRS = 9
 _MOST_ROUNDS = 3
 _POWER, _LEAST_POWER_PX, _TIE = 0.8, 0.5, 0.9
-_SIMPLE = ("axes", "scale", "swapped", "order")
+_SIMPLE = ("axes", "scale", "turned", "swapped", "order")
 _GAIN = 1.05
 _LEAST_FOR_TWO = 6
 _FAR_OFF = 0.2
@@ -207,6 +207,8 @@ def _whole_trials(
             what = "the focal lengths and principal points" if whole else "the focal lengths"
             yield _Trial("scale", everyone, f"{what} are {1 / scale:.3g} times what they should be",
                          partial(_scaled, factor=scale, whole=whole))  # fmt: skip
+    for what, turn in _TURNS:
+        yield _Trial("turned", everyone, f"photographs and masks are {what}", partial(_fields, change=turn))
     if count >= 3:
         for shift in (-1, 1):
             order = np.roll(np.arange(count), shift)
@@ -239,12 +241,8 @@ def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence, pose
         )
         for s in (1 / 4, 1 / 2, 2, 4)
     ]
-    trials += [
-        ("its mask is mirrored left to right", lambda o: _fields(o, lambda f: f[:, ::-1])),
-        ("its mask is upside down", lambda o: _fields(o, lambda f: f[::-1])),
-        ("its mask is turned by 180 degrees", lambda o: _fields(o, lambda f: f[::-1, ::-1])),
-        ("its mask is inverted", lambda o: _fields(o, lambda f: -f)),
-    ]
+    turns = (*_TURNS, ("inverted", lambda f: -f))
+    trials += [(f"its mask is {what}", partial(_fields, change=turn)) for what, turn in turns]
     best, said, index = _GAIN * fit.power_without(view), "", np.array([view])
     enough = max(2 * fit.score_without(view), _FLOOR_PX)
     for detail, change in trials:
@@ -268,6 +266,12 @@ def _inverse(outlines: Outlines) -> Outlines:
     )
 
 
+_TURNS: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
+    ("turned by 180 degrees", lambda f: f[::-1, ::-1]),
+    ("mirrored left to right", lambda f: f[:, ::-1]),
+    ("upside down", lambda f: f[::-1]),
+)
+"""Turns that leave an image's size as it is, those of EXIF's tags 3, 2 and 4, and what undoes each."""
 _AXES: tuple[Change, ...] = (
     lambda o: _turned(o, _FLIP),
     _inverse,
