@@ -105,8 +105,8 @@ def number(value: Any, what: str, path: Path) -> float:
     ):
         todo = f"write it without quotes: {value.strip():.30}"
         damaged(path, f"{what} is a text, {value[:40]!r}, not a number", "a number in quotes", todo)
-    if isinstance(value, str) and (todo := _with_point(value)):
-        damaged(path, f"{what} is {value.strip()!r}, not a number", _COMMAS, todo)
+    if isinstance(value, str) and (point := _with_point(value)):
+        damaged(path, f"{what} is {value.strip()!r}, not a number", _COMMAS, point)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         damaged(
             path, f"{what} is {_shown(value)}, not a finite number", cause="a damaged or wrongly written file"
