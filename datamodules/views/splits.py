@@ -36,6 +36,8 @@ class Split:
     """SHA-256 of each index file read, by its name."""
     rule: str
     """How the views were chosen, for people."""
+    free: tuple[int, ...] = ()
+    """Of views spread evenly: all that they were spread over."""
 
 
 def every_eighth(positions: Sequence[int]) -> Pools:
@@ -123,9 +125,12 @@ def choose(
             pool, rules = every, [*rules[:-1], "no view is held out"]
         train, rule = _pick_training(root, names, pool, every, request.views)
         rules.append(rule)
+        free = tuple(pool)
+    else:
+        free = ()
     tested = held if request.test else []
     _refuse_shared(train, tested, f"{train_where} and {test_where}", root)
-    return Split(train, tested, hashes, "; ".join(rules))
+    return Split(train, tested, hashes, "; ".join(rules), free)
 
 
 def _pick_training(

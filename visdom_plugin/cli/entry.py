@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
+from visdom_plugin.cli.clashes import refuse_clashes
 from visdom_plugin.cli.early import read_early
 from visdom_plugin.compute.openmp import wait_briefly
 from visdom_plugin.errors import ConfigError, VisDomError
@@ -44,6 +45,8 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
         return 0
     try:
         _check_views(early.views)
+        if not early.help:
+            refuse_clashes(words)
         with for_commands():
             return command(words) or 0
     except VisDomError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 import time
 from collections.abc import Sequence
@@ -79,6 +80,8 @@ def _main(argv: Sequence[str]) -> int:
         made = [f._replace(todo=todo) if f.kind == "few" else f for f in found.findings]
         found = replace(found, findings=made)
     report = {"scene": scene.name, **describe_check(found, views.names, inverted=options.invert_masks)}
+    if folder is not None and found.usable:
+        report["choice"] = _suggest(scene, found, views.names, folder, read_options(options))
     report["seconds"] = {
         "load": round(loaded - started, 3),
         "check": round(time.perf_counter() - loaded, 3),
@@ -96,6 +99,24 @@ def _main(argv: Sequence[str]) -> int:
     return FOUND if found.findings else 0
 
 
+def _suggest(
+    scene: Scene, found: Check, names: Sequence[str], folder: Path, reading: dict[str, Any]
+) -> dict[str, Any] | None:
+    """How good the choice of views is, and a better one; None where somebody chose."""
+    from visdom_plugin.cli.suggest_views import suggest_views, unfit_views
+
+    level = logging.getLogger("datamodules")
+    before = level.level
+    level.setLevel(logging.ERROR)  # it was all said when the scene was read
+    try:
+        made = suggest_views(scene, unfit_views([*found.findings, *found.notes], names), folder, **reading)
+    except SceneError:  # of views that nobody asked for
+        return None
+    finally:
+        level.setLevel(before)
+    return None if made is None else {**made._asdict(), "said": made.describe()}
+
+
 def warn_of_faults(scene: Scene, *, inverted: bool = False) -> None:
     """A brief check before training: every finding as one warning on the log.
 
@@ -105,8 +126,6 @@ def warn_of_faults(scene: Scene, *, inverted: bool = False) -> None:
     Raises:
         SceneError: masks are certainly inverted; what would be trained is the background.
     """
-    import logging
-
     log = logging.getLogger(__name__)
     if not scene.train.has_masks:
         return
@@ -253,6 +272,8 @@ def summarise_fit(report: dict[str, Any]) -> list[str]:
     lines = [report["k_why"]] if "k_why" in report else []
     if lines and not GEOMETRY.isdisjoint(f["kind"] for f in report["findings"]):
         lines = ["Which K the views allow is told once poses and intrinsics fit the masks."]
+    if report.get("choice"):
+        lines.append(report["choice"]["said"])
     if "misfit" in report:
         lines += [
             f"Masks and cameras miss each other by {report['misfit']:.2%} of the object's size on average; 0 is a "

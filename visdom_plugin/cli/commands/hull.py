@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from visdom_plugin.cli.clashes import NEEDS_OF_HULL, NEEDS_OF_MASKS_OUT, refuse_unread
 from visdom_plugin.cli.commands.check import carving_views, check_views, describe_check, summarise_fit
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
@@ -68,6 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(argv: Sequence[str]) -> None:
     options = tyro.cli(Options, args=list(argv), prog="visdom-hull")
+    refuse_unread(argv, (*NEEDS_OF_HULL, *NEEDS_OF_MASKS_OUT))
     folder = options.find_scene_folder()
     if options.out is not None and options.out.suffix.lower() not in ENDINGS:
         raise ConfigError(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from visdom_plugin.cli.clashes import NEEDS_OF_PREPARE, refuse_unread
 from visdom_plugin.cli.entry import run
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.prepare.settings import BoardSettings, MaskSettings, MaskWay, Volume
@@ -81,6 +82,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(argv: Sequence[str]) -> None:
     options = tyro.cli(Options, args=list(argv), prog="visdom-prepare")
+    refuse_unread(argv, NEEDS_OF_PREPARE)
+    other = "--print-board" if options.print_board else "--demo" if options.demo else None
+    if options.photographs is not None and other is not None:
+        raise ConfigError(
+            f"{other} makes something of its own, and {options.photographs} would not be read",
+            todo=f"leave out {other}, or the folder of photographs",
+        )
     board = BoardSettings(**{f.name: getattr(options, f.name) for f in fields(BoardSettings)})
     if options.print_board is not None:
         _print_board(options, board)

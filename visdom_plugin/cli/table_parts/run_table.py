@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from visdom_plugin.cli.options import resolve_device
 from visdom_plugin.errors import ConfigError, unknown_name
 from visdom_plugin.tables.results import Results
-from visdom_plugin.tables.spec import Column, TableSpec, check_spec
+from visdom_plugin.tables.spec import BUILT_IN, Column, TableSpec, check_spec
 
 if TYPE_CHECKING:
     from visdom_plugin.tables.run.executors import Executor
@@ -92,9 +93,11 @@ def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | Non
     folder, runs = find_folders(spec, options)
     # Refuses metrics, layouts and places in the paper that are not there.
     summarise(Results(spec))
-    made = plan(spec, runs, make_workshop(options.device, options.executor), _read_roots(options))
+    made = plan(spec, runs, make_workshop(options.device, options.executor), _read_roots(spec, options))
     overview = Overview(quiet=options.quiet)
     executor = _make_executor(spec, options, runs, overview.tick)
+    if options.executor != "slurm" and not options.dry_run:
+        resolve_device(options.device)  # once here, not in every run
     if options.dry_run:
         sys.stdout.write("\n".join(describe_plan(made)) + "\n")
         troubles = dict.fromkeys(task.trouble for task in made.tasks.values() if task.trouble)
@@ -172,7 +175,9 @@ def change_spec(spec: TableSpec, options: TableOptions) -> TableSpec:
     columns = spec.columns
     if options.data is not None:
         if not options.data.expanduser().is_dir():
-            raise ConfigError(f"there is no folder {options.data}", where="--data")
+            raise ConfigError(
+                f"there is no folder {options.data}", where="--data", todo="name a scene's folder"
+            )
         views = options.views or columns[0].views
         columns = (Column(options.data.resolve().name, "data", (".",), views),)
     if options.views:
@@ -216,12 +221,19 @@ def describe_plan(made: Plan) -> list[str]:
     return [*lines, f"{jobs}, {runs}, {todo} of them not finished"]
 
 
-def _read_roots(options: TableOptions) -> dict[str, Path]:
-    roots = {}
+def _read_roots(spec: TableSpec, options: TableOptions) -> dict[str, Path]:
+    roots, known = {}, sorted({column.root for column in spec.columns} - {BUILT_IN, "data"})
     for text in options.root:
         name, equals, folder = text.partition("=")
         if not (name and equals and folder):
             raise ConfigError(f"--root {text} is not NAME=DIR", todo="e.g. --root mip360=/data/mip360")
+        if name not in known and (options.data is not None or name != "data"):
+            what = f"the table has no data root {name!r}"
+            raise (
+                unknown_name(what, name, known, where=f"--root {text}", todo="roots")
+                if known
+                else ConfigError(what, where=f"--root {text}", todo="leave it out")
+            )
         roots[name] = Path(folder)
     if options.data is not None:
         roots["data"] = options.data
@@ -234,9 +246,10 @@ def _make_executor(spec: TableSpec, options: TableOptions, runs: Path, tick: Cal
 
     kind = options.executor or ("process" if options.workers is None else "local")
     if options.workers is not None and kind != "local":
-        raise ConfigError(f"--workers {options.workers} does not go with the executor {kind!r}")
+        what = f"--workers {options.workers} does not go with the executor {kind!r}"
+        raise ConfigError(what, todo="leave out --workers, or take --executor local")
     if options.workers is not None and options.workers < 1:
-        raise ConfigError(f"--workers is {options.workers}; it must be 1 or more")
+        raise ConfigError(f"--workers is {options.workers}", todo="use 1 or more, or leave it out")
     resources = read_config(spec, options.slurm)
     if kind == "process":
         return Here(tick)

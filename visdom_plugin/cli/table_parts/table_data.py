@@ -84,9 +84,10 @@ class DataHasher:
 
         with _hushed():
             found = take_fingerprint(folder, known=self._files, **load_options(**reading))
-        if reading.get("train_list") is not None and found.train != reading["views"]:
+        if found.train != reading["views"]:
+            listed = "train_list lists" if reading.get("train_list") is not None else "the scene has only"
             raise ConfigError(
-                f"train_list lists {found.train} training views, views says {reading['views']}",
+                f"{listed} {found.train} training views, views says {reading['views']}",
                 cause="the table would be labelled with another number of views than its runs have",
                 todo=f"views: {found.train}",
             )
