@@ -94,26 +94,18 @@ class FreeViews(NamedTuple):
     cameras: Cameras
 
 
-def find_free_views(path: Path, *, data_format: str | None = None, **reading: Any) -> FreeViews | None:
+def find_free_views(capture: Capture, request: Request) -> FreeViews | None:
     """The views that could train where nobody says which; None where a list, an index file or a split does.
 
     No pixel is read.
 
-    Args:
-        reading: fields of `request.Request`.
-
     Raises:
-        SceneError: for faults of the folder, the calibration and the choice of views.
+        SceneError: for faults of the choice of views and of their cameras.
     """
-    from datamodules.recognise import opening, read_capture
-
-    request = replace(Request(**reading), test=False)
-    with opening(path) as root:
-        capture = read_capture(root, data_format, request)
-        free = choose_files(capture, request).split.free
-        if not free:
-            return None
-        return FreeViews(tuple(capture.frames[i].name for i in free), capture.calibrate(free).cameras)
+    free = choose_files(capture, replace(request, test=False)).split.free
+    if not free:
+        return None
+    return FreeViews(tuple(capture.frames[i].name for i in free), capture.calibrate(free).cameras)
 
 
 def open_capture(capture: Capture, request: Request) -> Scene:

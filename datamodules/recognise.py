@@ -15,6 +15,7 @@ from visdom_plugin.errors import ConfigError, SceneError
 
 if TYPE_CHECKING:
     from datamodules.capture import Capture
+    from datamodules.open_scene import FreeViews
     from visdom_plugin.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -119,6 +120,15 @@ def load(
 
     with opening(path) as root:
         return open_capture(read_capture(root, data_format, request), request)
+
+
+def load_free_views(path: str | Path, *, data_format: str | None = None, **reading: Any) -> FreeViews | None:
+    """`open_scene.find_free_views` of the scene in a folder; `reading` holds fields of `request.Request`."""
+    from datamodules.open_scene import find_free_views
+
+    request = Request(**reading)
+    with opening(path) as root:
+        return find_free_views(read_capture(root, data_format, request), request)
 
 
 @contextmanager

@@ -57,3 +57,13 @@ def open_scene(
 def load_options(*, missing_masks: str = "error", **reading: Any) -> dict[str, Any]:
     """Options of a command on how a scene is read, as `datamodules.load` takes them."""
     return reading if missing_masks == "error" else reading | {"allow_missing_masks": True}
+
+
+def carving_views(views: Views) -> tuple[Views, list]:
+    """The views whose masks were given, and these masks: True on what is known to be object."""
+    given = [i for i in range(len(views)) if views.mask_origin(i) == "given"]
+    cameras, masks, ignore = views.silhouettes()
+    images = [views.images[i] for i in given]
+    names = [views.names[i] for i in given]
+    chosen = Views(cameras, images, masks, names, ignore=ignore)
+    return chosen, [chosen.demanded(i) for i in range(len(chosen))]

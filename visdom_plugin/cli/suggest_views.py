@@ -55,11 +55,11 @@ def suggest_views(
         unfit: views of it whose masks are cut off or otherwise unfit.
         folder: of the scene; with `views`, `downscale`, `seed` and `reading` as it was read.
     """
-    from datamodules.open_scene import find_free_views
+    from datamodules.recognise import load_free_views
     from visdom_plugin.cli.scenes import load_options, open_scene
     from visdom_plugin.geometry.cameras import look_at_point
 
-    free = find_free_views(folder, views=views, downscale=downscale, **load_options(**reading))
+    free = load_free_views(folder, views=views, downscale=downscale, **load_options(**reading))
     names = [] if free is None else list(free.names)
     count = len(scene.train)
     if (
@@ -100,7 +100,7 @@ def suggest_views(
 
 def find_unfit(scene: Scene) -> set[str]:
     """Training views without a mask, or whose mask is cut off or otherwise unfit."""
-    from visdom_plugin.cli.commands.check import carving_views
+    from visdom_plugin.cli.scenes import carving_views
     from visdom_plugin.hull.checks.check import check
 
     views, masks = carving_views(scene.train)

@@ -8,7 +8,8 @@ import torch
 from datamodules import load
 from tests.datamodules.layouts import layout_writers as w
 from tests.hull.checks.faults import capture_of
-from visdom_plugin.cli.commands.check import carving_views, check_views
+from visdom_plugin.cli.commands.check import check_views
+from visdom_plugin.cli.scenes import carving_views
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.checks.causes.pose_conventions import PoseFaults, pose_faults
 from visdom_plugin.hull.checks.check import check

@@ -61,7 +61,7 @@ def _main(argv: Sequence[str]) -> int:
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         raise ConfigError("this is a file, not a folder", where=f"--out {options.out}", todo="name a folder")
     started = time.perf_counter()
-    from visdom_plugin.cli.scenes import open_scene
+    from visdom_plugin.cli.scenes import carving_views, open_scene
 
     try:
         scene = open_scene(folder, **read_options(options), fill=False, test=False)
@@ -126,6 +126,8 @@ def warn_of_faults(scene: Scene, *, inverted: bool = False) -> None:
     Raises:
         SceneError: masks are certainly inverted; what would be trained is the background.
     """
+    from visdom_plugin.cli.scenes import carving_views
+
     log = logging.getLogger(__name__)
     if not scene.train.has_masks:
         return
@@ -146,21 +148,11 @@ def _advise(finding: Finding, views: int, inverted: bool) -> str:
 
 def find_briefly(scene: Scene) -> list[dict[str, Any]]:
     """What the brief check finds, as `describe_check` spells it."""
+    from visdom_plugin.cli.scenes import carving_views
+
     views, masks = carving_views(scene.train)
     found = check_views(views, masks, brief=True, layout=scene.source.get("layout"))
     return describe_check(found, views.names)["findings"]
-
-
-def carving_views(views: Views) -> tuple[Views, list]:
-    """The views whose masks were given, and these masks: True on what is known to be object."""
-    from visdom_plugin.scene import Views
-
-    given = [i for i in range(len(views)) if views.mask_origin(i) == "given"]
-    cameras, masks, ignore = views.silhouettes()
-    images = [views.images[i] for i in given]
-    names = [views.names[i] for i in given]
-    chosen = Views(cameras, images, masks, names, ignore=ignore)
-    return chosen, [chosen.demanded(i) for i in range(len(chosen))]
 
 
 def check_views(

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from visdom_plugin.cli.clashes import NEEDS_OF_HULL, NEEDS_OF_MASKS_OUT, refuse_unread
-from visdom_plugin.cli.commands.check import carving_views, check_views, describe_check, summarise_fit
+from visdom_plugin.cli.commands.check import check_views, describe_check, summarise_fit
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
+from visdom_plugin.cli.scenes import carving_views
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.inside.config import InsideConfig
