@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from visdom_plugin.ssim import ssim
+from visdom_plugin.ssim import l1_and_ssim
 
 
 def composite_target(
@@ -46,16 +46,15 @@ def photometric_loss(rgb: Tensor, target: Tensor, ssim_weight: float, weight: Te
         weight: (H, W) float, 0 at pixels that take no part and 1 elsewhere, or None when all do. Both means
             are over the pixels that do; to the windows of SSIM the others look as what is outside the image.
     """
-    if weight is None:
-        l1 = (rgb - target).abs().mean()
-        return l1 if ssim_weight == 0 else (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(rgb, target))
-    counted = weight[..., None] > 0
-    rgb, target = torch.where(counted, rgb, 0.0), torch.where(counted, target, 0.0)
-    share = weight.mean().clamp_min(1 / weight.numel())
-    l1 = (rgb - target).abs().mean() / share
+    share: float | Tensor = 1.0
+    if weight is not None:
+        counted = weight[..., None] > 0
+        rgb, target = torch.where(counted, rgb, 0.0), torch.where(counted, target, 0.0)
+        share = weight.mean().clamp_min(1 / weight.numel())
     if ssim_weight == 0:
-        return l1
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(rgb, target)) / share
+        return (rgb - target).abs().mean() / share
+    l1, similarity = l1_and_ssim(rgb, target)
+    return ((1 - ssim_weight) * l1 + ssim_weight * (1 - similarity)) / share
 
 
 OPAQUE = 1 - 1e-6

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from visdom_plugin.compute.kernels import kernel
+from visdom_plugin.compute.lanes import WIDTH, count_up, fill, load, store, totals, where
 from visdom_plugin.compute.parallel import parallel_for
 
 RADIUS = 5
@@ -35,9 +36,24 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
         )
     if x.dtype != y.dtype:
         raise ValueError(f"ssim compares images of one dtype, got {x.dtype} and {y.dtype}")
-    if x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64):
-        return _Ssim.apply(x, y.detach(), x.requires_grad)
-    return _ssim_by_convolution(x, y.detach())
+    return l1_and_ssim(x, y)[1]
+
+
+def l1_and_ssim(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean absolute difference and `ssim` of two images, on the CPU in one pass over them.
+
+    Args:
+        x, y: as for `ssim`, which checks them.
+    """
+    y = y.detach()
+    if x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64) and _fits(x):
+        return _Compare.apply(x, y, x.requires_grad)
+    return (x - y).abs().mean(), _ssim_by_convolution(x, y)
+
+
+def _fits(x: Tensor) -> bool:
+    """Whether a row of an image fills a vector."""
+    return x.shape[-2] * x.shape[-1] >= WIDTH
 
 
 def _window() -> np.ndarray:
@@ -64,7 +80,7 @@ def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:
     return (luminance * contrast).mean()
 
 
-class _Ssim(torch.autograd.Function):
+class _Compare(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, y, with_slopes):
         shape = x.shape
@@ -73,120 +89,125 @@ class _Ssim(torch.autograd.Function):
         ]
         count, height, _ = images[0].shape
         window = _window().astype(images[0].dtype)
-        sums = np.zeros(count * height, np.float64)
+        sums = np.zeros((count * height, 2), np.float64)
         slopes = np.empty((3, *images[0].shape) if with_slopes else (3, 0, 0, 0), images[0].dtype)
         parallel_for(_similarity, count * height, ROWS_PER_PIECE, *images, shape[-1], window, sums, slopes)
         ctx.save_for_backward(x, y)
         ctx.rest = (shape[-1], window, slopes)
-        return x.new_tensor(sums.sum() / max(images[0].size, 1))
+        ctx.set_materialize_grads(False)
+        l1, similarity = sums.sum(0) / max(images[0].size, 1)
+        return x.new_tensor(l1), x.new_tensor(similarity)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, g):
+    def backward(ctx, g_l1, g_similarity):
         x, y = ctx.saved_tensors
         channels, window, slopes = ctx.rest
         images = [z.detach().reshape(slopes.shape[1:]).contiguous().numpy() for z in (x, y)]
         out = np.empty_like(images[0])
-        scale = out.dtype.type(float(g) / max(out.size, 1))
+        scales = np.array([float(g or 0) / max(out.size, 1) for g in (g_l1, g_similarity)], out.dtype)
         parallel_for(
-            _gradient,
-            out.shape[0] * out.shape[1],
-            ROWS_PER_PIECE,
-            *images,
-            channels,
-            window,
-            slopes,
-            scale,
-            out,
-        )
+            _gradient, out.shape[0] * out.shape[1], ROWS_PER_PIECE, *images, channels, window, slopes, scales, out
+        )  # fmt: skip
         return torch.from_numpy(out).reshape(x.shape), None, None
-
-
-@kernel(fast=True)
-def _blur_across(padded, channels, window, out):
-    """Blurs one row (W C,) given with RADIUS pixels of zeros on both sides."""
-    for j in range(len(out)):
-        out[j] = 0
-    for tap in range(TAPS):
-        weight, source = window[tap], padded[tap * channels : tap * channels + len(out)]
-        for j in range(len(out)):
-            out[j] += weight * source[j]
-
-
-@kernel(fast=True)
-def _add_products(x, y, weight, mx, my, xx, yy, xy):
-    for j in range(len(x)):
-        a, b = x[j], y[j]
-        wa, wb = weight * a, weight * b
-        mx[j] += wa
-        my[j] += wb
-        xx[j] += wa * a
-        yy[j] += wb * b
-        xy[j] += wa * b
-
-
-@kernel(fast=True)
-def _compare(maps):
-    """Sum of the similarity over one row; turns the first three rows of `maps` into its derivatives."""
-    real = maps.dtype.type
-    c1, c2, one, two = real(C1), real(C2), real(1), real(2)
-    mean_x, mean_y, square_x, square_y, product = maps[0], maps[1], maps[2], maps[3], maps[4]
-    total = real(0)
-    for j in range(maps.shape[1]):
-        mx, my = mean_x[j], mean_y[j]
-        d1 = one / (mx * mx + my * my + c1)
-        d2 = one / (square_x[j] - mx * mx + square_y[j] - my * my + c2)
-        n1, n2 = two * mx * my + c1, two * (product[j] - mx * my) + c2
-        value = n1 * n2 * d1 * d2
-        total += value
-        by_xx, by_xy = -value * d2, two * n1 * d1 * d2
-        # x's mean acts directly and through the variance and covariance.
-        mean_x[j] = two * (my * n2 * d1 * d2 - mx * value * d1) - two * mx * by_xx - my * by_xy
-        mean_y[j], square_x[j] = by_xx, by_xy
-    return total
 
 
 @kernel(error_model="numpy")
 def _similarity(begin, end, x, y, channels, window, sums, slopes):
-    """Rows begin .. end - 1 of all images (B, H, W C): sums (rows,), and slopes (3, B, H, W C) unless empty."""
+    """Rows begin .. end - 1 of all images (B, H, W C): sums (rows, 2) of the absolute difference and of the
+    similarity, and, unless it is empty, slopes (3, B, H, W C): its derivatives by the blurred x, x^2 and x y.
+
+    The last vector of a row ends where the row ends: it repeats part of the one before.
+    """
     _, height, size = x.shape
-    edge = RADIUS * channels
-    padded = np.zeros((5, size + 2 * edge), x.dtype)
-    maps = np.empty((5, size), x.dtype)
+    real = x.dtype.type
+    zero, one, two, c1, c2 = real(0), real(1), real(2), real(C1), real(C2)
+    edge, area = RADIUS * channels, x.size
+    stride = size + 2 * edge
+    maps, row_sums = np.zeros(4 * stride, x.dtype), np.empty(WIDTH, x.dtype)
     for row in range(begin, end):
-        image, v = row // height, row % height
-        inner = padded[:, edge : edge + size]
-        inner[:] = 0
-        for tap in range(max(0, RADIUS - v), min(TAPS, height + RADIUS - v)):
-            r = v + tap - RADIUS
-            _add_products(
-                x[image, r], y[image, r], window[tap], inner[0], inner[1], inner[2], inner[3], inner[4]
-            )
-        for k in range(5):
-            _blur_across(padded[k], channels, window, maps[k])
-        sums[row] = _compare(maps)
-        if slopes.size:
-            for k in range(3):
-                slopes[k, image, v] = maps[k]
+        v = row % height
+        first, last = max(0, RADIUS - v), min(TAPS, height + RADIUS - v)
+        for j0 in range(0, size, WIDTH):
+            j = min(j0, size - WIDTH)
+            blur_x, blur_y = fill(zero), fill(zero)
+            squares, products = fill(zero), fill(zero)
+            for tap in range(first, last):
+                at = (row + tap - RADIUS) * size + j
+                a, b, weight = load(x, at), load(y, at), window[tap]
+                blur_x, blur_y = blur_x + a * weight, blur_y + b * weight
+                squares, products = squares + (a * a + b * b) * weight, products + a * b * weight
+            at = edge + j
+            store(maps, at, blur_x)
+            store(maps, at + stride, blur_y)
+            store(maps, at + 2 * stride, squares)
+            store(maps, at + 3 * stride, products)
+        differences, similarities = fill(zero), fill(zero)
+        for j0 in range(0, size, WIDTH):
+            j = min(j0, size - WIDTH)
+            mx, my = fill(zero), fill(zero)
+            squares, products = fill(zero), fill(zero)
+            for tap in range(TAPS):
+                at, weight = tap * channels + j, window[tap]
+                mx, my = mx + load(maps, at) * weight, my + load(maps, at + stride) * weight
+                squares = squares + load(maps, at + 2 * stride) * weight
+                products = products + load(maps, at + 3 * stride) * weight
+            means = mx * mx + my * my
+            d1, d2 = one / (means + c1), one / (squares - means + c2)
+            n1, n2 = two * mx * my + c1, two * (products - mx * my) + c2
+            value = n1 * n2 * d1 * d2
+            fresh = count_up(real(j)) >= real(j0)
+            apart = load(x, row * size + j) - load(y, row * size + j)
+            differences = differences + where(fresh, where(apart < zero, zero - apart, apart), zero)
+            similarities = similarities + where(fresh, value, zero)
+            if slopes.size:
+                by_xx, by_xy = zero - value * d2, two * n1 * d1 * d2
+                # x's mean acts directly and through the variance and covariance.
+                by_mean = two * (my * n2 * d1 * d2 - mx * value * d1) - two * mx * by_xx - my * by_xy
+                at = row * size + j
+                store(slopes, at, by_mean)
+                store(slopes, at + area, by_xx)
+                store(slopes, at + 2 * area, by_xy)
+        store(row_sums, 0, totals((differences, similarities)))
+        sums[row, 0], sums[row, 1] = row_sums[0], row_sums[1]
 
 
 @kernel(error_model="numpy")
-def _gradient(begin, end, x, y, channels, window, slopes, scale, out):
-    """Rows begin .. end - 1 of the gradient by x: the window is its own transpose, so slopes are blurred again."""
+def _gradient(begin, end, x, y, channels, window, slopes, scales, out):
+    """Rows begin .. end - 1 of the gradient by x, scales (2,) times those of the mean difference and similarity.
+
+    The window is its own transpose, so slopes are blurred again.
+    """
     _, height, size = x.shape
-    edge = RADIUS * channels
-    padded = np.zeros((3, size + 2 * edge), x.dtype)
-    maps = np.empty((3, size), x.dtype)
+    real = x.dtype.type
+    zero, two = real(0), real(2)
+    edge, area = RADIUS * channels, x.size
+    stride = size + 2 * edge
+    maps = np.zeros(3 * stride, x.dtype)
+    by_l1, by_similarity = scales[0], scales[1]
     for row in range(begin, end):
-        image, v = row // height, row % height
-        for k in range(3):
-            inner = padded[k, edge : edge + size]
-            inner[:] = 0
-            for tap in range(max(0, RADIUS - v), min(TAPS, height + RADIUS - v)):
-                weight, source = window[tap], slopes[k, image, v + tap - RADIUS]
-                for j in range(size):
-                    inner[j] += weight * source[j]
-            _blur_across(padded[k], channels, window, maps[k])
-        for j in range(size):
-            slope = maps[0, j] + x.dtype.type(2) * x[image, v, j] * maps[1, j] + y[image, v, j] * maps[2, j]
-            out[image, v, j] = scale * slope
+        v = row % height
+        first, last = max(0, RADIUS - v), min(TAPS, height + RADIUS - v)
+        for j0 in range(0, size, WIDTH):
+            j = min(j0, size - WIDTH)
+            by_mean, by_xx, by_xy = fill(zero), fill(zero), fill(zero)
+            for tap in range(first, last):
+                at, weight = (row + tap - RADIUS) * size + j, window[tap]
+                by_mean = by_mean + load(slopes, at) * weight
+                by_xx = by_xx + load(slopes, at + area) * weight
+                by_xy = by_xy + load(slopes, at + 2 * area) * weight
+            store(maps, edge + j, by_mean)
+            store(maps, edge + j + stride, by_xx)
+            store(maps, edge + j + 2 * stride, by_xy)
+        for j0 in range(0, size, WIDTH):
+            j = min(j0, size - WIDTH)
+            by_mean, by_xx, by_xy = fill(zero), fill(zero), fill(zero)
+            for tap in range(TAPS):
+                at, weight = tap * channels + j, window[tap]
+                by_mean = by_mean + load(maps, at) * weight
+                by_xx = by_xx + load(maps, at + stride) * weight
+                by_xy = by_xy + load(maps, at + 2 * stride) * weight
+            a, b = load(x, row * size + j), load(y, row * size + j)
+            side = where(a > b, by_l1, where(a < b, -by_l1, fill(zero)))
+            slope = by_mean + two * a * by_xx + b * by_xy
+            store(out, row * size + j, side + slope * by_similarity)

@@ -188,6 +188,8 @@ def store(typing_context, array, index, lanes):
 def where(typing_context, condition, yes, no):
     """`yes` where a condition holds, else `no`; either may be a number."""
     element = getattr(yes, "element", yes)
+    if element != getattr(no, "element", no):
+        return None
 
     def generate(context, builder, signature, arguments):
         chosen = [
