@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +24,8 @@ from visdom_plugin.training.protocols import PixelBatch
 log = logging.getLogger(__name__)
 
 
+SPEAK_AFTER = 5.0
+"""Seconds after which a view that takes as long again is announced."""
 MESH_RESOLUTION = 160
 """Voxels along the longest side of what `mesh_density` looks at."""
 
@@ -122,19 +125,28 @@ def render_image(
         camera: one camera, shape ().
         render_rays: origins and directions (n, 3), world frame, to colour (n, 3) over the background, opacity
             (n,), and depth (n,) along the ray in the field's frame.
-        chunk: rays at a time.
+        chunk: rays at a time. Memory beside the result is that of one chunk, whatever the size of the image.
     """
-    rays = rays_of(camera.to(dtype=torch.float64))
-    shape = rays.origins.shape[:2]
-    origins, directions = rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)
-    with torch.no_grad():
-        parts = [
-            render_rays(origins[i : i + chunk], directions[i : i + chunk])
-            for i in range(0, len(origins), chunk)
-        ]
-    rgb, alpha, distance = (torch.cat(x) for x in zip(*parts, strict=True))
-    along = (directions @ camera.forward.to(directions)).float()
-    depth = torch.where(alpha > 0, distance * along / frame.scale, 0)
+    camera = camera.to(dtype=torch.float64)
+    width, height = camera.size
+    device = camera.intrinsics.device
+    rgb, alpha, depth = (torch.empty(width * height, *tail, device=device) for tail in ((3,), (), ()))
+    started, said = time.perf_counter(), False
+    for first in range(0, width * height, chunk):
+        pixels = torch.arange(first, min(first + chunk, width * height), device=device)
+        uv = torch.stack([pixels % width, pixels // width], -1).to(camera.intrinsics) + 0.5
+        origins, directions = rays_of(camera, uv)
+        with torch.no_grad():
+            colour, opacity, distance = render_rays(origins, directions)
+        along = (directions @ camera.forward).float()
+        part = slice(first, first + len(pixels))
+        rgb[part], alpha[part] = colour, opacity
+        depth[part] = torch.where(opacity > 0, distance * along / frame.scale, 0)
+        spent, share = time.perf_counter() - started, (first + len(pixels)) / (width * height)
+        if not said and spent > SPEAK_AFTER and spent / share - spent > SPEAK_AFTER:
+            said = True
+            log.info("a view of %d x %d pixels takes about %.0f s", width, height, spent / share)
+    shape = (height, width)
     return Render(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape))
 
 
