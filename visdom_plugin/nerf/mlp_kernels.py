@@ -100,12 +100,47 @@ def _padded(n):
     return (n + LANES - 1) // LANES * LANES
 
 
+@intrinsic
+def _move(typing_context, of, of_at, to, to_at, count):
+    """to[to_at + lane] = of[of_at + lane] for lane < min(count, LANES); touches nothing else."""
+
+    def generate(context, builder, signature, arguments):
+        vector, number = ir.VectorType(ir.FloatType(), LANES), ir.IntType(32)
+        mask_type, pointer = ir.VectorType(ir.IntType(1), LANES), vector.as_pointer()
+        one = builder.insert_element(
+            ir.Constant(ir.VectorType(ir.IntType(64), LANES), ir.Undefined), arguments[4], number(0)
+        )
+        every = builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(number, LANES), [0] * LANES))
+        lanes = ir.Constant(ir.VectorType(ir.IntType(64), LANES), list(range(LANES)))
+        mask = builder.icmp_signed("<", lanes, every)
+        places = []
+        for i in (0, 2):
+            data = context.make_array(signature.args[i])(context, builder, arguments[i]).data
+            places.append(builder.bitcast(builder.gep(data, [arguments[i + 1]]), pointer))
+        load = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(vector, [pointer, number, mask_type, vector]),
+            f"llvm.masked.load.v{LANES}f32.p0",
+        )
+        store = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(ir.VoidType(), [vector, pointer, number, mask_type]),
+            f"llvm.masked.store.v{LANES}f32.p0",
+        )
+        zero = ir.Constant(vector, [0.0] * LANES)
+        builder.call(
+            store, [builder.call(load, [places[0], number(4), mask, zero]), places[1], number(4), mask]
+        )
+        return context.get_dummy_value()
+
+    return types.none(of, types.int64, to, types.int64, types.int64), generate
+
+
 @kernel()
 def _copy(rows, width, of, of_at, of_row, to, to_at, to_row):
     for r in range(rows):
-        source, target = of[of_at + r * of_row :], to[to_at + r * to_row :]
-        for q in range(width):
-            target[q] = source[q]
+        for q in range(0, width, LANES):
+            _move(of, of_at + r * of_row + q, to, to_at + r * to_row + q, width - q)
 
 
 @kernel()

@@ -12,6 +12,7 @@ import torch
 
 from tests.nerf.encoding import hash_twin
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.nerf.encoding import hash_cpu
 from visdom_plugin.nerf.encoding.hash_grid import (
     HashLayout,
     default_backend,
@@ -204,6 +205,21 @@ def test_initial_table_and_mean_squares():
     for level in range(SMALL.levels):
         rows = table[SMALL.offsets[level] : SMALL.offsets[level + 1]]
         assert squares[level].item() == pytest.approx(rows.double().square().mean().item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_mean_squares_and_their_gradient_agree_with_torch(large, monkeypatch):
+    monkeypatch.setattr(hash_cpu, "LARGE", 0 if large else 1 << 40)
+    layout = HashLayout(levels=3, features=3, base_resolution=3, max_resolution=40, log2_table_size=13)
+    table = initial_table(layout, torch.Generator().manual_seed(0), 0.5)
+    results = []
+    for values in (table, table.double()):  # float64 takes plain torch
+        values.requires_grad_()
+        squares = mean_square_per_level(values, layout)
+        (gradient,) = torch.autograd.grad((squares * torch.tensor([1.0, -2, 3])).sum(), values)
+        results.append((squares.double(), gradient.double()))
+    for fast, slow in zip(*results, strict=True):
+        torch.testing.assert_close(fast, slow, rtol=1e-6, atol=1e-12)
 
 
 def test_mismatches_are_told():

@@ -19,6 +19,10 @@ from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 
 PIECES_PER_LEVEL = 4
 """Launching a piece costs some 10 us; below this many, two threads wait for one another at the end."""
+LARGE = 1 << 20
+"""Numbers in a table from which it is worth while to square them on several threads."""
+SUMMED = 1024
+"""Squares summed in float32 at a time."""
 
 
 def encode_cpu(points: Tensor, scales: Tensor | None, table: Tensor, layout: HashLayout):
@@ -74,3 +78,48 @@ class _Encode(torch.autograd.Function):
             _flat(g_out), layout.features, *_describe(layout), _flat(g_table),
         )  # fmt: skip
         return g_table, None, None, None
+
+
+class MeanSquares(torch.autograd.Function):
+    """(levels,) means of the squared features of each level of a table, and their gradient, level by level."""
+
+    @staticmethod
+    def forward(ctx, table, sizes):
+        ctx.save_for_backward(table)
+        ctx.sizes = sizes
+        levels, out = [rows.detach().numpy() for rows in table.split(sizes)], torch.empty(len(sizes))
+
+        def find(begin: int, end: int) -> None:
+            for level in range(begin, end):
+                out[level] = _mean_square(levels[level].reshape(-1))
+
+        parallel_for(find, len(sizes), _grain(table, sizes))
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, g):
+        (table,) = ctx.saved_tensors
+        out = torch.empty_like(table)
+        pairs = list(zip(*(x.detach().split(ctx.sizes) for x in (table, out)), g.tolist(), strict=True))
+
+        def scale(begin: int, end: int) -> None:
+            for rows, to, factor in pairs[begin:end]:
+                np.multiply(rows.numpy(), np.float32(2 * factor / rows.numel()), out=to.numpy())
+
+        parallel_for(scale, len(pairs), _grain(table, ctx.sizes))
+        return out, None
+
+
+def _grain(table: Tensor, sizes: tuple[int, ...]) -> int:
+    """Levels in a piece: all of a small table, which a second thread would not have done sooner."""
+    return 1 if table.numel() > LARGE else len(sizes)
+
+
+def _mean_square(values: np.ndarray) -> float:
+    """Of (n,), exact enough in float32: sums of blocks are summed in float64."""
+    whole = len(values) // SUMMED * SUMMED
+    blocks = values[:whole].reshape(-1, SUMMED)
+    total = np.einsum("ij,ij->i", blocks, blocks).sum(dtype=np.float64)
+    rest = values[whole:]
+    return float((total + np.einsum("i,i->", rest, rest)) / len(values))

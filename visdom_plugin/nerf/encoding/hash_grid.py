@@ -66,6 +66,10 @@ def initial_table(layout: HashLayout, generator: torch.Generator, scale: float =
 
 def mean_square_per_level(table: Tensor, layout: HashLayout) -> Tensor:
     """(levels,) mean of the squared features of each level; Zip-NeRF's hash decay is a multiple of their sum."""
+    if table.device.type == "cpu" and table.dtype == torch.float32:
+        from visdom_plugin.nerf.encoding.hash_cpu import MeanSquares
+
+        return MeanSquares.apply(table, layout.sizes)
     return torch.stack([rows.square().mean() for rows in table.split(layout.sizes)])
 
 
