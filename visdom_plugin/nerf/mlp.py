@@ -129,7 +129,7 @@ class _Layers(torch.autograd.Function):
         ctx.shape = shape
         out = torch.empty(len(x), shape.sizes[-1][1])
         none = np.empty(0, np.float32)
-        _run(x, extra, shape, parameters, _flat(out), none, none, np.empty((0, 0), np.float32))
+        _run(x, extra, shape, parameters, _flat(out), none, none, none)
         return out
 
     @staticmethod
@@ -140,14 +140,14 @@ class _Layers(torch.autograd.Function):
         counts = [p.numel() for p in parameters]
         sums = np.empty((-(-len(x) // mlp_kernels.PIECE), sum(counts)), np.float32)
         none = np.empty(0, np.float32)
-        _run(x, extra, ctx.shape, parameters, none, _flat(g_out.contiguous()), _flat(g_x), sums)
+        _run(x, extra, ctx.shape, parameters, none, _flat(g_out.contiguous()), _flat(g_x), sums.reshape(-1))
         split = torch.from_numpy(sums.sum(0)).split(counts)
         return g_x, None, None, *(g.view_as(p) for g, p in zip(split, parameters, strict=True))
 
 
 def _run(x: Tensor, extra: Tensor, shape: Shape, parameters: Sequence[Tensor], *results: np.ndarray) -> None:
     repeat = max(len(x) // max(len(extra), 1), 1)
-    numbers = (len(x), x.shape[1], shape.lead, extra.shape[1], repeat, shape.again, shape.biased)
+    numbers = np.array([len(x), x.shape[1], shape.lead, extra.shape[1], repeat, shape.again, shape.biased])
     sizes = np.array([*shape.sizes, (shape.sizes[-1][1], 0)], np.int64)
     flat = torch.cat([p.detach().reshape(-1) for p in parameters])
     pieces = -(-len(x) // mlp_kernels.PIECE)

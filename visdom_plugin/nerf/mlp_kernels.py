@@ -1,10 +1,10 @@
 """Small perceptrons on the CPU: all layers of a tile of points in one go, forward and back.
 
-Arrays are flat float32. Parameters lie one layer after the other, weights (outputs, inputs), then biases if there
-are any. A layer's input is the output of the one before, at layer `again` followed by the net's own input once
-more. Points go through in tiles whose activations stay in the first cache; rows are padded to whole vectors.
-Backward, activations are computed again, and every piece of points sums gradients of its own: they are added up in
-order, so that the result is the same for any number of threads.
+Arrays are flat float32; all that a call works on lies in one of them, `room`. Parameters lie one layer after the
+other, weights (outputs, inputs), then biases if there are any. A layer's input is the output of the one before, at
+layer `again` followed by the net's own input once more. Points go through in tiles whose activations stay in the
+first cache; rows are padded to whole vectors. Backward, activations are computed again, and every piece of points
+sums gradients of its own: they are added up in order, so that the result is the same for any number of threads.
 """
 
 from __future__ import annotations
@@ -27,17 +27,33 @@ PIECE = 1024
 
 @intrinsic
 def _accumulate(
-    typing_context, a, a_at, a_row, a_step, b, b_at, b_step, count, base, base_at, base_row,
-    gate, gate_at, gate_row, least, out, out_at, out_row,
+    typing_context, room, a_at, a_row, a_step, b_at, b_step, count, base_at, base_row, gate_at, gate_row, least,
+    out_at, out_row,
 ):  # fmt: skip
-    """out[out_at + r out_row + lane] = base[...] + sum over k < count of a[a_at + r a_row + k a_step] times
-    b[b_at + k b_step + lane], for r < ROWS, lane < LANES; at least `least`, and 0 unless gate[...] is above 0."""
+    """Matrix product of `ROWS` rows and `LANES` lanes within `room`, the sums in registers.
+
+    room[out_at + r out_row + lane] = room[base_at + ...] + sum over k < count of room[a_at + r a_row + k a_step]
+    room[b_at + k b_step + lane]; at least `least`, and 0 unless room[gate_at + ...] is above 0.
+    """
 
     def generate(context, builder, signature, arguments):
-        def pointer(i):
-            return context.make_array(signature.args[i])(context, builder, arguments[i]).data
-
-        a_at, a_row, a_step, b_at, b_step, count = (arguments[i] for i in (1, 2, 3, 5, 6, 7))
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        (
+            _,
+            a_at,
+            a_row,
+            a_step,
+            b_at,
+            b_step,
+            count,
+            base_at,
+            base_row,
+            gate_at,
+            gate_row,
+            least,
+            out_at,
+            out_row,
+        ) = arguments
         vector, index = ir.VectorType(ir.FloatType(), LANES), ir.IntType(32)
         undefined, zeros = (
             ir.Constant(vector, ir.Undefined),
@@ -51,51 +67,53 @@ def _accumulate(
             one = builder.insert_element(undefined, number, index(0))
             return builder.shuffle_vector(one, undefined, zeros)
 
-        def vectors(i):
-            start, at, row = pointer(i), arguments[i + 1], arguments[i + 2]
+        def vectors(at, row):
             places = (
-                builder.gep(start, [builder.add(at, builder.mul(row, row.type(r)))]) for r in range(ROWS)
+                builder.gep(data, [builder.add(at, builder.mul(row, row.type(r)))]) for r in range(ROWS)
             )
             return [builder.bitcast(place, vector.as_pointer()) for place in places]
 
-        left, right = pointer(0), pointer(4)
-        sums = [cgutils.alloca_once_value(builder, builder.load(place, align=4)) for place in vectors(8)]
+        sums = [
+            cgutils.alloca_once_value(builder, builder.load(place, align=4))
+            for place in vectors(base_at, base_row)
+        ]
         with cgutils.for_range(builder, count) as loop:
-            place = builder.gep(right, [builder.add(b_at, builder.mul(loop.index, b_step))])
+            place = builder.gep(data, [builder.add(b_at, builder.mul(loop.index, b_step))])
             factor = builder.load(builder.bitcast(place, vector.as_pointer()), align=4)
             first = builder.add(a_at, builder.mul(loop.index, a_step))
             for r, total in enumerate(sums):
-                place = builder.gep(left, [builder.add(first, builder.mul(a_row, a_row.type(r)))])
+                place = builder.gep(data, [builder.add(first, builder.mul(a_row, a_row.type(r)))])
                 number = everywhere(builder.load(place, align=4))
                 builder.store(builder.call(fused, [number, factor, builder.load(total)]), total)
-        floor, nothing = everywhere(arguments[14]), ir.Constant(vector, [0.0] * LANES)
-        for total, gate, place in zip(sums, vectors(11), vectors(15), strict=True):
+        floor, nothing = everywhere(least), ir.Constant(vector, [0.0] * LANES)
+        for total, gate, place in zip(
+            sums, vectors(gate_at, gate_row), vectors(out_at, out_row), strict=True
+        ):
             value = builder.load(total)
             value = builder.select(builder.fcmp_ordered("<", value, floor), floor, value)  # NaN stays
             is_open = builder.fcmp_ordered(">", builder.load(gate, align=4), nothing)
             builder.store(builder.select(is_open, value, nothing), place, align=4)
         return context.get_dummy_value()
 
-    three, two = [types.int64] * 3, [types.int64] * 2
-    return types.none(a, *three, b, *three, base, *two, gate, *two, types.float32, out, *two), generate
+    integer = types.int64
+    return types.none(room, *[integer] * 10, types.float32, integer, integer), generate
 
 
-@kernel()
+@kernel(error_model="numpy")
 def _multiply(
-    rows, width, a, a_row, a_step, b, b_at, b_step, count, base, base_at, base_row, gate, gate_at, gate_row, least,
-    out, out_at, out_row,
+    rows, width, room, a_at, a_row, a_step, b_at, b_step, count, base_at, base_row, gate_at, gate_row, least,
+    out_at, out_row,
 ):  # fmt: skip
     """`_accumulate` for any number of rows and lanes, which are rounded up."""
     for lane in range(0, width, LANES):
         for r in range(0, rows, ROWS):
             _accumulate(
-                a, r * a_row, a_row, a_step, b, b_at + lane, b_step, count,
-                base, base_at + r * base_row + lane, base_row,
-                gate, gate_at + r * gate_row + lane, gate_row, least, out, out_at + r * out_row + lane, out_row,
+                room, a_at + r * a_row, a_row, a_step, b_at + lane, b_step, count, base_at + r * base_row + lane,
+                base_row, gate_at + r * gate_row + lane, gate_row, least, out_at + r * out_row + lane, out_row,
             )  # fmt: skip
 
 
-@kernel()
+@kernel(error_model="numpy")
 def _padded(n):
     return (n + LANES - 1) // LANES * LANES
 
@@ -136,48 +154,37 @@ def _move(typing_context, of, of_at, to, to_at, count):
     return types.none(of, types.int64, to, types.int64, types.int64), generate
 
 
-@kernel()
+@kernel(error_model="numpy")
 def _copy(rows, width, of, of_at, of_row, to, to_at, to_row):
     for r in range(rows):
         for q in range(0, width, LANES):
             _move(of, of_at + r * of_row + q, to, to_at + r * to_row + q, width - q)
 
 
-@kernel()
-def _lay_out(sizes, widths, biased, parameters, starts):
-    """Fills in `starts` (L + 1, 6), of each layer: where its weights, turned to (inputs, outputs padded), begin;
-    its first parameter; where its tile of inputs (TILE, row) begins, and its row; where its padded biases begin;
-    and its weights (outputs, inputs padded).
-
-    Returns weights and biases, and the numbers that all tiles take.
-    """
-    layers = len(sizes) - 1
-    place, parameter, tile = 0, 0, 0
-    for layer in range(layers + 1):
-        inputs, outputs = sizes[layer]
+@kernel(error_model="numpy")
+def _lay_out(sizes, again, biased, places):
+    """Fills in `places` (L + 1, 8), of each layer: how much of its input comes from the layer before; its first
+    parameter; and where these begin: its weights turned to (inputs, outputs padded), its biases, its weights
+    (outputs, inputs padded), the gradient of these (outputs padded, inputs padded), that of its biases, its tile
+    (TILE, inputs from the layer before, padded). Returns where the last ends."""
+    at, parameter = 0, 0
+    for layer in range(len(sizes)):
+        inputs, outputs = sizes[layer, 0], sizes[layer, 1]
         wide, row = _padded(outputs), _padded(inputs)
-        starts[layer, 0], starts[layer, 1], starts[layer, 2] = place, parameter, tile
-        starts[layer, 3], starts[layer, 4] = _padded(widths[layer]), place + inputs * wide
-        starts[layer, 5] = place + (inputs + 1) * wide
-        place += (inputs + 1) * wide + outputs * row
+        hidden = sizes[layer - 1, 1] if layer > 0 and layer == again else inputs
+        places[layer, 0], places[layer, 1], places[layer, 2] = hidden, parameter, at
+        places[layer, 3] = at + inputs * wide
+        places[layer, 4] = places[layer, 3] + wide
+        # Behind each matrix a vector to spare, over which a padded row may reach.
+        places[layer, 5] = places[layer, 4] + outputs * row + LANES
+        places[layer, 6] = places[layer, 5] + wide * row + LANES
+        places[layer, 7] = places[layer, 6] + wide
+        at = places[layer, 7] + TILE * _padded(hidden)
         parameter += (inputs + biased) * outputs
-        tile += TILE * starts[layer, 3]
-    packed = np.zeros(place + LANES, np.float32)
-    for layer in range(layers):
-        inputs, outputs = sizes[layer]
-        wide, row = _padded(outputs), _padded(inputs)
-        first = starts[layer, 1]
-        for o in range(outputs):
-            for i in range(inputs):
-                weight = parameters[first + o * inputs + i]
-                packed[starts[layer, 0] + i * wide + o] = weight
-                packed[starts[layer, 5] + o * row + i] = weight
-            if biased:
-                packed[starts[layer, 4] + o] = parameters[first + inputs * outputs + o]
-    return packed, tile
+    return at
 
 
-@kernel()
+@kernel(error_model="numpy")
 def run(begin, end, numbers, sizes, parameters, x, extra, out, g_out, g_x, g_sums):
     """Runs pieces begin .. end - 1 of `PIECE` points.
 
@@ -190,114 +197,97 @@ def run(begin, end, numbers, sizes, parameters, x, extra, out, g_out, g_x, g_sum
         g_x: the gradient of x, comes out.
         g_sums: (pieces, parameters) the parameters' gradients by piece, come out.
     """
-    points, x_row, lead, extra_width, repeat, again, biased = numbers
-    layers, none = len(sizes) - 1, sizes[-1, 1]  # 0: not a constant, for which numba would compile a copy
-    step, whole = none + 1, none + TILE
-    width, unbound = x_row - lead, np.float32(-np.inf)
-    # What a layer's own tile holds: at `again` without the net's input, which is in the first.
-    widths, starts = sizes[:, 0].copy(), np.empty((layers + 1, 6), np.int64)
-    if again > 0:
-        widths[again] = sizes[again - 1, 1]
-    packed, room = _lay_out(sizes, widths, biased, parameters, starts)
-    tiles, back = np.zeros(room, np.float32), len(g_out) > 0
-    most, largest = 0, 0
+    points, x_row, lead = numbers[0], numbers[1], numbers[2]
+    extra_width, repeat, again, biased = numbers[3], numbers[4], numbers[5], numbers[6]
+    layers, zero = (
+        len(sizes) - 1,
+        sizes[-1, 1],
+    )  # a mere 0 is a type of its own, and functions are compiled once more
+    one, whole, width, back = zero + 1, zero + TILE, x_row - lead, len(g_out) > 0
+    places = np.empty((layers + 1, 8), np.int64)
+    ones = _lay_out(sizes, again, biased, places)
+    most = zero
     for layer in range(layers + 1):
         most = max(most, _padded(sizes[layer, 0]))
-        largest = max(largest, _padded(sizes[layer, 1]))
-    ones, zeros = np.ones(most, np.float32), np.zeros(most, np.float32)
-    grads = np.empty((layers if back else 0, largest * most + LANES), np.float32)
-    above, below = np.empty(TILE * most, np.float32), np.empty(TILE * most, np.float32)
     free = _padded(width)
-    to_input = np.empty(TILE * free, np.float32)
+    zeros = ones + most
+    above, below, to_input = zeros + most, zeros + most + TILE * most, zeros + most + 2 * TILE * most
+    room = np.zeros(to_input + TILE * free + LANES, np.float32)
+    room[ones:zeros] = 1
+    for layer in range(layers):
+        inputs, outputs, at = sizes[layer, 0], sizes[layer, 1], places[layer, 1]
+        for o in range(outputs):
+            for i in range(inputs):
+                room[places[layer, 2] + i * _padded(outputs) + o] = parameters[at + o * inputs + i]
+        _copy(outputs, inputs, parameters, at, inputs, room, places[layer, 4], _padded(inputs))
+        if biased:
+            _copy(one, outputs, parameters, at + inputs * outputs, zero, room, places[layer, 3], zero)
     for piece in range(begin, end):
-        grads[:] = 0
-        biases = np.zeros((layers, most), np.float32)
+        for layer in range(layers if back else zero):
+            room[places[layer, 5] : places[layer, 7]] = 0
         for first in range(piece * PIECE, min((piece + 1) * PIECE, points), TILE):
-            count = min(whole, points - first)
-            row = starts[0, 3]
-            _copy(count, width, x, first * x_row + lead, x_row, tiles, none, row)
+            count, at, row = min(whole, points - first), places[0, 7], _padded(sizes[0, 0])
+            _copy(count, width, x, first * x_row + lead, x_row, room, at, row)
             for p in range(count):
-                _copy(
-                    step,
-                    extra_width,
-                    extra,
-                    (first + p) // repeat * extra_width,
-                    none,
-                    tiles,
-                    p * row + width,
-                    none,
-                )
-            tiles[count * row : TILE * row] = 0
+                of = (first + p) // repeat * extra_width
+                _copy(one, extra_width, extra, of, zero, room, at + p * row + width, zero)
+            room[at + count * row : at + TILE * row] = 0
             for layer in range(layers):
-                outputs, at, row = sizes[layer, 1], starts[layer + 1, 2], starts[layer + 1, 3]
-                wide, least = _padded(outputs), np.float32(0) if layer + 1 < layers else unbound
-                base, base_at, base_row, weights = packed, starts[layer, 4], none, starts[layer, 0]
-                if layer > 0 and layer == again:
+                inputs, outputs, hidden = sizes[layer, 0], sizes[layer, 1], places[layer, 0]
+                wide, to, to_row = _padded(outputs), places[layer + 1, 7], _padded(places[layer + 1, 0])
+                base, base_row, weights = places[layer, 3], zero, places[layer, 2]
+                least = np.float32(0 if layer + 1 < layers else -np.inf)
+                if hidden < inputs:
                     _multiply(
-                        whole, outputs, tiles[:], starts[0, 3], step, packed, weights + widths[layer] * wide, wide,
-                        sizes[0, 0], base, base_at, base_row, ones, none, none, unbound, tiles, at, row,
+                        whole, outputs, room, places[0, 7], row, one, weights + hidden * wide, wide,
+                        inputs - hidden, base, base_row, ones, zero, np.float32(-np.inf), to, to_row,
                     )  # fmt: skip
-                    base, base_at, base_row = tiles, at, row
+                    base, base_row = to, to_row
                 _multiply(
-                    whole, outputs, tiles[starts[layer, 2] :], starts[layer, 3], step, packed, weights, wide,
-                    widths[layer], base, base_at, base_row, ones, none, none, least, tiles, at, row,
+                    whole, outputs, room, places[layer, 7], _padded(hidden), one, weights, wide, hidden,
+                    base, base_row, ones, zero, least, to, to_row,
                 )  # fmt: skip
-            outputs, at, row = sizes[layers, 0], starts[layers, 2], starts[layers, 3]
+            outputs, at = sizes[layers, 0], places[layers, 7]
             if not back:
-                _copy(count, outputs, tiles, at, row, out, first * outputs, outputs)
+                _copy(count, outputs, room, at, _padded(outputs), out, first * outputs, outputs)
                 continue
-            above[:] = 0
-            _copy(count, outputs, g_out, first * outputs, outputs, above, none, most)
-            to_input[:] = 0
+            room[above : above + TILE * most] = 0
+            _copy(count, outputs, g_out, first * outputs, outputs, room, above, most)
+            room[to_input : to_input + TILE * free] = 0
             for layer in range(layers - 1, -1, -1):
-                inputs, outputs, grad = sizes[layer, 0], sizes[layer, 1], grads[layer]
-                at, tile_row, row, weights = (
-                    starts[layer, 2],
-                    starts[layer, 3],
-                    _padded(inputs),
-                    starts[layer, 5],
-                )
+                inputs, outputs, hidden = sizes[layer, 0], sizes[layer, 1], places[layer, 0]
+                at, tile_row, to_row = places[layer, 7], _padded(hidden), _padded(inputs)
+                grad, weights, unbound = places[layer, 5], places[layer, 4], np.float32(-np.inf)
                 _multiply(
-                    outputs, widths[layer], above, step, most, tiles, at, tile_row, count, grad, none, row,
-                    ones, none, none, unbound, grad, none, row,
+                    outputs, hidden, room, above, one, most, at, tile_row, count, grad, to_row, ones, zero,
+                    unbound, grad, to_row,
                 )  # fmt: skip
-                if layer > 0 and layer == again:
+                if hidden < inputs:
                     _multiply(
-                        outputs, sizes[0, 0], above, step, most, tiles, none, starts[0, 3], count,
-                        grad, widths[layer], row, ones, none, none, unbound, grad, widths[layer], row,
+                        outputs, inputs - hidden, room, above, one, most, places[0, 7], row, count,
+                        grad + hidden, to_row, ones, zero, unbound, grad + hidden, to_row,
                     )  # fmt: skip
-                for p in range(count * biased):
+                for p in range(count if biased else zero):
                     for q in range(outputs):
-                        biases[layer, q] += above[p * most + q]
-                if layer == 0 or layer == again:
+                        room[places[layer, 6] + q] += room[above + p * most + q]
+                if layer == 0 or hidden < inputs:
                     _multiply(
-                        count, width, above, most, step, packed,
-                        weights + (none if layer == 0 else widths[layer]), row, outputs, to_input, none, free,
-                        ones, none, none, unbound, to_input, none, free,
+                        count, width, room, above, most, one, weights + (zero if layer == 0 else hidden), to_row,
+                        outputs, to_input, free, ones, zero, unbound, to_input, free,
                     )  # fmt: skip
                 if layer > 0:
                     _multiply(
-                        count, widths[layer], above, most, step, packed, weights, row, outputs, zeros, none, none,
-                        tiles, at, tile_row, unbound, below, none, most,
+                        count, hidden, room, above, most, one, weights, to_row, outputs, zeros, zero, at, tile_row,
+                        unbound, below, most,
                     )  # fmt: skip
                 above, below = below, above
             for p in range(count):
                 for q in range(lead):
                     g_x[(first + p) * x_row + q] = 0
-            _copy(count, width, to_input, none, free, g_x, first * x_row + lead, x_row)
-        for layer in range(layers if back else 0):
+            _copy(count, width, room, to_input, free, g_x, first * x_row + lead, x_row)
+        for layer in range(layers if back else zero):
             inputs, outputs = sizes[layer, 0], sizes[layer, 1]
-            _copy(
-                outputs, inputs, grads[layer], none, _padded(inputs), g_sums[piece], starts[layer, 1], inputs
-            )
+            at = piece * len(parameters) + places[layer, 1]
+            _copy(outputs, inputs, room, places[layer, 5], _padded(inputs), g_sums, at, inputs)
             if biased:
-                _copy(
-                    step,
-                    outputs,
-                    biases[layer],
-                    none,
-                    none,
-                    g_sums[piece],
-                    starts[layer, 1] + inputs * outputs,
-                    none,
-                )
+                _copy(one, outputs, room, places[layer, 6], zero, g_sums, at + inputs * outputs, zero)
