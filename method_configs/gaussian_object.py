@@ -44,6 +44,7 @@ SPEC = MethodSpec(
             densify_every=30,
             prune_large_from=60,
             opacity_reset_every=0,
+            fewest_gaussians=1_000,
         ),
     ),
     full=GaussianObjectConfig(),

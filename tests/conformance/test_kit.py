@@ -87,3 +87,10 @@ def test_help_and_version_need_no_method():
     done = kit("--help")
     assert done.returncode == 0 and "--method=NAME" in done.stdout
     assert kit("--version").returncode == 0
+
+
+def test_a_method_that_lacks_weights_is_skipped_with_the_reason(monkeypatch):
+    monkeypatch.delenv("VISDOM_DIFFUSION_WEIGHTS", raising=False)
+    done = kit("--method", "gaussianobject", "-rs")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "gaussianobject cannot be trained here" in done.stdout and "passed" not in done.stdout

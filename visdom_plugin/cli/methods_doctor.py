@@ -23,6 +23,7 @@ def examine(known: Registry) -> list[str]:
         ("lpips", "LPIPS metric: pip install 'visdom-plugin[lpips]'"),
         ("av", "H.264 video: pip install 'visdom-plugin[video]'"),
         ("nerfstudio", "ns-train with the visible domain: pip install 'visdom-plugin[nerfstudio]'"),
+        ("diffusers", "method:gaussianobject: pip install 'visdom-plugin[diffusion]'"),
         ("nerfacc", "its rays and occupancy grids: pip install nerfacc"),
         ("submitit", "jobs on a Slurm cluster: pip install submitit"),
     ):

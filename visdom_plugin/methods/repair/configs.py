@@ -138,6 +138,8 @@ class RepairConfig:
     prune_large_from: int = 300
     opacity_reset_every: int = 500
     """Gaussians' options of this stage, see those of the coarse one."""
+    fewest_gaussians: int = 10_000
+    """Of so many or fewer none is removed for being faint or large."""
 
     def __post_init__(self) -> None:
         counts = ("steps", "poses", "refresh_every", "ddim_steps", "densify_every")

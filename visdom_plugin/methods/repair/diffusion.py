@@ -24,6 +24,10 @@ class Networks:
     def __init__(self, files: NetworkFiles, device: torch.device):
         import diffusers
         from transformers import CLIPTextModel, CLIPTokenizer
+        from transformers.utils import logging as transformers_log
+
+        # The run has a bar of its own, or is quiet.
+        transformers_log.disable_progress_bar()
 
         def load(kind: Any, part: str) -> Any:
             settings = {"variant": files.variants[part], "torch_dtype": torch.float32}

@@ -60,9 +60,8 @@ class FineTuning:
     def train_step(self, batch: ViewBatch, step: int) -> StepOutput:
         networks, c = self.networks, self.config.lora
         draw = seeding.generator(self.seed, "lora", step)
-        white = torch.ones(3, device=batch.image.device)
-        target = centre_square(composite_target(batch.image, batch.mask, white), self.config.image_size)
         hint = self.corrupted(batch, step, draw)
+        target = self.photograph(batch, hint)
         template = TEMPLATES[int(torch.randint(len(TEMPLATES), (), generator=draw))]
         text = networks.encode_text(template.format(c.token))
         latent = networks.encode_image(target, draw)
@@ -75,6 +74,19 @@ class FineTuning:
 
     def optimise(self, step: int, output: StepOutput) -> None:
         self.updates.step()
+
+    @torch.no_grad()
+    def photograph(self, batch: ViewBatch, hint: Tensor) -> Tensor:
+        """(S, S, 3) the view's photograph on white: of an unknown mask the coarse Gaussians tell what is the
+        object, and where pixels are ignored the render stays as it is."""
+        white = torch.ones(3, device=batch.image.device)
+        alpha = None if batch.mask_known else self.coarse.splats.draw(batch.camera, white).alpha
+        seen = composite_target(batch.image, batch.mask, white, alpha=alpha, mask_known=batch.mask_known)
+        target = centre_square(seen, self.config.image_size)
+        if batch.weight is None:
+            return target
+        counted = centre_square(batch.weight[..., None].expand(-1, -1, 3), self.config.image_size)
+        return torch.where(counted > 0, target, hint)
 
     @torch.no_grad()
     def corrupted(self, batch: ViewBatch, step: int, draw: torch.Generator) -> Tensor:

@@ -37,9 +37,12 @@ class FullHarmonics(Strategy):
 class GoingOn(GsGo):
     """The coarse method in its last stage: Gaussians that are there already."""
 
+    config: GaussianObjectConfig
+
     def build(self, views: Views, hull: Hull | None, generator: Generator) -> None:
         super().build(views, hull, generator)
-        self.strategy = FullHarmonics(self.splats, self.strategy.schedule, self.strategy.split_generator)
+        schedule = replace(self.strategy.schedule, fewest=self.config.repair.fewest_gaussians)
+        self.strategy = FullHarmonics(self.splats, schedule, self.strategy.split_generator)
 
 
 def stage_config(config: GaussianObjectConfig) -> GaussianObjectConfig:

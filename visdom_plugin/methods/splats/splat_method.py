@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import ClassVar, Generic, TypeVar
 
@@ -64,8 +65,7 @@ class SplatMethod(CorrectsColours, ABC, Generic[Config]):
             )
         self.device, self.seed, self.hooks, self.origin = device, seed, list(hooks), views.origin
         if device.type == "cpu":
-            log.info("loading the CPU kernels (compiled once per machine, which takes 10 to 30 s)")
-            warm_up()
+            _load_kernels()
         self.unit = float(mean_distance(views.cameras.to("cpu", torch.float64))) or 1.0
         if self.config.colour_correction:
             self.correction = ColourCorrection(len(views), self.config.steps, device)
@@ -96,6 +96,13 @@ class SplatMethod(CorrectsColours, ABC, Generic[Config]):
         path = Path(folder) / "point_cloud.ply"
         write_gaussians(path, self.splats.in_scene(), self.origin)
         return [path]
+
+
+@cache
+def _load_kernels() -> None:
+    """Once in a process, which may set up many runs."""
+    log.info("loading the CPU kernels (compiled once per machine, which takes 10 to 30 s)")
+    warm_up()
 
 
 def refuse_unseen(means: Tensor, views: Views, near: float) -> None:

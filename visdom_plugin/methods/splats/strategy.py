@@ -65,6 +65,8 @@ class Schedule:
     """After this step densification removes large Gaussians, too; None for never."""
     largest: LargestGaussian | None = None
     """How large one may be that stays then."""
+    fewest: int = 0
+    """Of so many or fewer, densification removes none but those that it splits."""
     unpooling: Unpooling | None = None
     """Densification by proximity; None for none."""
 
@@ -180,10 +182,13 @@ class Strategy:
             self._unpool(unpooling, split)
         new = len(splats) - len(split)
         shown = splats.gaussians().detach()
-        gone = torch.cat([split, split.new_zeros(new)]) | (shown.opacity_logits.sigmoid() < c.prune_opacity)
+        gone = torch.cat([split, split.new_zeros(new)])
+        prunes = len(split) > self.schedule.fewest
+        if prunes:
+            gone = gone | (shown.opacity_logits.sigmoid() < c.prune_opacity)
         start, largest = self.schedule.prune_large_from, self.schedule.largest
         faint = int(gone.sum()) - len(children["means"]) // 2
-        if start is not None and largest is not None and done > start:
+        if prunes and start is not None and largest is not None and done > start:
             on_screen = torch.cat([self._radius, self._radius.new_zeros(new)])
             in_space = shown.log_scales.exp().amax(-1)
             gone |= on_screen > (largest.radius if largest.radius_px is None else largest.radius_px)
