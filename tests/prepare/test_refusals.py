@@ -204,6 +204,13 @@ def test_masks_that_are_asked_for_and_missing(photographs, tmp_path, capsys):
     assert "6 of 6 photographs have no mask" in said
 
 
+def test_a_name_of_poses_that_is_a_little_wrong(folder, tmp_path, capsys):
+    save(folder, "a.jpg")
+    (folder / "cameras.xml").write_text("<document/>")
+    said = refusal(folder, tmp_path, capsys, "--poses", str(folder / "camera.xml"))
+    assert "cameras.xml" in said
+
+
 def test_rembg_without_models(photographs, tmp_path, capsys):
     said = refusal(photographs.folder, tmp_path, capsys, "--mask-source", "rembg")
     assert "--rembg-models DIR" in said

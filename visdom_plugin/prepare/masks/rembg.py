@@ -18,7 +18,7 @@ def cut_with_rembg(
     """Masks N x (H, W) bool of N x (H, W, 3) uint8 photographs.
 
     Raises:
-        ConfigError: rembg is not installed, or the model's file is not in the folder.
+        ConfigError: rembg is not installed, or the model's file is not in the folder or cannot be opened.
     """
     session, remove = open_session(models, model)
     masks = []
@@ -47,8 +47,9 @@ def open_session(models: str | None, model: str) -> tuple[Any, Any]:
             where=f"--rembg-models {models}",
             todo=f"--rembg-model {files[0]}" if files else "download the model from rembg's release page",
         )
-    # Read by rembg when a session is opened; without it, it would download the model.
-    os.environ["U2NET_HOME"] = str(folder.resolve())
+    # Read by rembg when a session is opened: where models lie, and that one of another checksum than that of the
+    # release is not to be downloaded in its place.
+    os.environ |= {"U2NET_HOME": str(folder.resolve()), "MODEL_CHECKSUM_DISABLED": "1"}
     try:
         from rembg import new_session, remove
     except ImportError as error:
@@ -57,4 +58,12 @@ def open_session(models: str | None, model: str) -> tuple[Any, Any]:
             where="--mask-source rembg",
             todo="pip install 'visdom-plugin[rembg]', or take --mask-source grabcut",
         ) from error
-    return new_session(model), remove
+    try:
+        return new_session(model), remove
+    except Exception as error:  # ValueError of rembg, and whatever the network's runtime raises
+        raise ConfigError(
+            f"rembg cannot open {model}.onnx: {str(error)[:200]}",
+            where=f"--rembg-models {models}",
+            cause="the file is no model or cut short, or rembg knows no model of this name",
+            todo="download it again, and keep the name it has on rembg's release page",
+        ) from error

@@ -33,7 +33,14 @@ def place_by_file(path: Path, photographs: Sequence[Photograph]) -> Placed:
         SceneError: nothing that is read lies there, or it does not fit the photographs.
     """
     if not path.exists():
-        raise SceneError("there is no such file or folder of poses", where=f"--poses {path}")
+        there = sorted(p.name for p in path.parent.iterdir()) if path.parent.is_dir() else []
+        raise SceneError(
+            "there is no such file or folder of poses",
+            where=f"--poses {path}",
+            todo=f"one of what lies there: {list_some(there)}"
+            if there
+            else f"--poses board, or one of {_KNOWN}",
+        )
     found = _read_folder(path, photographs) if path.is_dir() else _read_file(path, photographs)
     if isinstance(found, Capture):
         return _match_capture(found, photographs, path)
