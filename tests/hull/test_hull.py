@@ -338,3 +338,10 @@ def test_a_hull_says_what_it_is_in_one_line():
     assert repr(hull) == "Hull(24 of 2x3x4 voxels, (0, 0, 0) .. (1, 1.5, 2))"
     carved = Hull(hull.occupancy, hull.bounds, {"kind": "visdom", "views": 4, "k": 3, "seconds": 0.2})
     assert repr(carved).endswith("(1, 1.5, 2), kind='visdom', views=4, k=3)")
+
+
+def test_centre_of_more_planes_than_a_byte_counts():
+    grid = np.zeros((600, 3, 5), bool)
+    grid[10:590, 1, 2:] = True
+    hull = Hull.from_grid(grid, np.array([[0, 0, 0], [600, 3, 5]]))
+    assert hull.centre == pytest.approx([300, 1.5, 3.5], abs=1e-12)

@@ -166,7 +166,7 @@ class Hull:
     def _find_centre(self) -> np.ndarray:
         if not self.voxels:
             return self.bounds.mean(0)
-        weights = [self.occupancy.sum(axis=tuple({0, 1, 2} - {a}), dtype=np.int64) for a in range(3)]
+        weights = _count_planes(self.occupancy)
         index = np.array([(w * (np.arange(len(w)) + 0.5)).sum() / w.sum() for w in weights])
         return self.bounds[0] + index * self.voxel_edges
 
@@ -190,17 +190,20 @@ class Hull:
         if not isinstance(points, Tensor):
             return self.contains(torch.as_tensor(np.asarray(points)), margin_voxels=margin_voxels).numpy()
         reach = int(np.ceil(margin_voxels))
-        grid = self._grid_on(points.device, reach)
 
         def frame() -> tuple[Tensor, ...]:
-            values = self.bounds[0] - reach * self.voxel_edges, self.voxel_edges, np.array(grid.shape)
+            shape = np.array(self.shape) + 2 * reach
+            values = self.bounds[0] - reach * self.voxel_edges, self.voxel_edges, shape
             return tuple(torch.from_numpy(x).to(points.device) for x in values)
 
         lower, edges, size = self._once(("frame around", str(points.device), reach), frame)
         index = torch.floor((points.detach().double() - lower) / edges)
         inside = ((index >= 0) & (index < size)).all(-1)
         x, y, z = torch.where(inside[..., None], index, 0.0).long().unbind(-1)
-        return inside & grid[x, y, z]
+        if points.device.type == "cpu" and not reach:
+            # numpy reads the grid itself; torch, which knows no read-only arrays, would need a copy.
+            return inside & torch.from_numpy(np.asarray(self.occupancy[x.numpy(), y.numpy(), z.numpy()]))
+        return inside & self._grid_on(points.device, reach)[x, y, z]
 
     def _grid_on(self, device: torch.device, reach: int = 0) -> Tensor:
         def make() -> Tensor:
@@ -344,6 +347,15 @@ class Hull:
 def _freeze(*arrays: np.ndarray) -> None:
     for array in arrays:
         array.flags.writeable = False
+
+
+def _count_planes(occupancy: np.ndarray) -> list[np.ndarray]:
+    """Occupied voxels in each plane across x, y and z: three int64 arrays."""
+    across_x = np.array([np.count_nonzero(plane) for plane in occupancy])
+    grid, columns = occupancy.view(np.uint8), np.zeros(occupancy.shape[1:], np.int64)
+    for first in range(0, len(grid), 255):  # as many as a byte can count
+        columns += np.add.reduce(grid[first : first + 255], axis=0, dtype=np.uint8)
+    return [across_x, columns.sum(1), columns.sum(0)]
 
 
 def occupied_box(occupancy: np.ndarray) -> np.ndarray:

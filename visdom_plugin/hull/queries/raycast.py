@@ -72,20 +72,26 @@ def _pack(begin: int, end: int, grid: np.ndarray, bits: np.ndarray) -> None:
 def _look_ahead(begin: int, end: int, bits: np.ndarray, ahead: np.ndarray) -> None:
     """Largest empty cubes by dynamic programming: one more than the smallest of the seven bricks ahead."""
     na, nb, nc = bits.shape
+    outside = np.full(nc, _FARTHEST - 1, np.uint8)
     for octant in range(begin, end):
         i, j, k = 1 - 2 * (octant & 1), 1 - 2 * (octant >> 1 & 1), 1 - 2 * (octant >> 2)
+        cubes = ahead[octant]
         for p in range(na):
             a = na - 1 - p if i > 0 else p
             for q in range(nb):
                 b = nb - 1 - q if j > 0 else q
+                row, word = cubes[a, b], bits[a, b]
+                beside = cubes[a + i, b] if p > 0 else outside
+                below = cubes[a, b + j] if q > 0 else outside
+                across = cubes[a + i, b + j] if p > 0 and q > 0 else outside
+                # The smallest of the four bricks one step ahead along z, from the step before.
+                before = np.uint8(_FARTHEST - 1)
                 for r in range(nc):
                     c = nc - 1 - r if k > 0 else r
-                    best = _FARTHEST - 1
-                    for n in range(1, 8):
-                        u, v, w = a + i * (n & 1), b + j * (n >> 1 & 1), c + k * (n >> 2)
-                        if 0 <= u < na and 0 <= v < nb and 0 <= w < nc:
-                            best = min(best, int(ahead[octant, u, v, w]))
-                    ahead[octant, a, b, c] = 0 if bits[a, b, c] else best + 1
+                    sides = min(min(beside[c], below[c]), across[c])
+                    best = np.uint8(min(min(sides, before), _FARTHEST - 1) + 1)
+                    row[c] = np.uint8(0) if word[c] else best
+                    before = np.uint8(min(sides, row[c]))
 
 
 def build_bricks(occupancy: np.ndarray) -> Bricks:
@@ -197,16 +203,16 @@ def _clip_axis(o: float, d: float, low: float, high: float, near: float, far: fl
 
 @kernel()
 def _cast(
-    begin: int, end: int, origins: np.ndarray, directions: np.ndarray, lower: np.ndarray, scale: np.ndarray,
-    box: np.ndarray, shape: np.ndarray, bits: np.ndarray, ahead: np.ndarray, both: bool, first: np.ndarray,
-    last: np.ndarray, hit: np.ndarray,
+    begin: int, end: int, origins: np.ndarray, directions: np.ndarray, single_origins: np.ndarray,
+    single_directions: np.ndarray, lower: np.ndarray, scale: np.ndarray, box: np.ndarray, shape: np.ndarray,
+    bits: np.ndarray, ahead: np.ndarray, both: bool, first: np.ndarray, last: np.ndarray, hit: np.ndarray,
 ) -> None:  # fmt: skip
-    # One origin may serve all rays of a camera.
-    step = 0 if len(origins) == 1 else 1
-    size, zero = (
-        np.empty(3),
-        0 * len(shape),
-    )  # a mere 0 is a type of its own: the walk would be compiled twice
+    # Rays in float64, or else in float32: two pairs of arrays of which one is empty, for one compiled kernel. One
+    # origin may serve all rays of a camera.
+    single = len(single_directions) > 0
+    step = 0 if len(origins) + len(single_origins) == 1 else 1
+    zero = 0 * len(shape)  # a mere 0 is a type of its own: the walk would be compiled twice
+    size = np.empty(3)
     for a in range(3):
         size[a] = 4.0 * shape[a]
     rays, turns, ends = np.empty((_PACK, 14)), np.empty((_PACK, 6), np.int64), np.empty((_PACK, 7))
@@ -218,7 +224,11 @@ def _cast(
             first[r], last[r], hit[r] = 0, 0, False
             near, far, length, reach = 0.0, np.inf, 0.0, 0.0
             for a in range(3):
-                o, d = (origins[r * step, a] - lower[a]) * scale[a], directions[r, a] * scale[a]
+                if single:
+                    o, d = float(single_origins[r * step, a]), float(single_directions[r, a])
+                else:
+                    o, d = origins[r * step, a], directions[r, a]
+                o, d = (o - lower[a]) * scale[a], d * scale[a]
                 near, far = _clip_axis(o, d, box[0, a], box[1, a], near, far)
                 length += d * d
                 reach += abs(o)
@@ -280,18 +290,18 @@ def _walk(
 ) -> tuple[Tensor, Tensor, Tensor]:
     origins = origins.reshape(1, 3) if origins.numel() == 3 else origins.expand(*shape, 3).reshape(-1, 3)
     directions = directions.expand(*shape, 3).reshape(-1, 3)
-    directions, origins = (
-        directions.double(),
-        origins.double(),
-    )  # one type, or the kernel is compiled for each
+    single = directions.dtype == torch.float32 and origins.dtype == torch.float32
+    if not single:
+        directions, origins = directions.double(), origins.double()
     bricks = hull._once("bricks", lambda: build_bricks(hull.occupancy))
     first, last = np.empty(len(directions)), np.empty(len(directions))
     hit = np.empty(len(directions), np.bool_)
     lower, scale = np.array(hull.bounds[0]), 1 / hull.voxel_edges
     box = hull._once("box", lambda: occupied_box(hull.occupancy).astype(float))
     shaped = (np.array(bricks.bits.shape), bricks.bits.reshape(-1), bricks.ahead.reshape(-1))
-    rays = (origins.contiguous().numpy(), directions.contiguous().numpy())
-    inputs = (*rays, lower, scale, box, *shaped, both)
+    rays = [origins.contiguous().numpy(), directions.contiguous().numpy()]
+    others = [np.empty((0, 3), np.float64 if single else np.float32)] * 2
+    inputs = (*(others + rays if single else rays + others), lower, scale, box, *shaped, both)
     parallel_for(_cast, len(directions), _GRAIN, *inputs, first, last, hit)
     near, far, met = (torch.from_numpy(x).reshape(shape) for x in (first, last, hit))
     return near, far, met
