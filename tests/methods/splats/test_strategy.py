@@ -83,6 +83,17 @@ def test_large_gaussians_go_only_after_the_step_that_says_so():
         assert left_of_large(LargestGaussian(10.0, 0.0, 5.0), start) == left
 
 
+@pytest.mark.parametrize(("fewest", "left"), [(0, 20), (29, 20), (30, 30), (31, 30)])
+def test_of_the_fewest_none_goes_for_being_faint(fewest, left):
+    strategy = strategy_of(schedule=Schedule(reset_opacity=range(0), fewest=fewest))
+    logits = strategy.splats.gaussians().opacity_logits.detach().clone()
+    logits[:10] = -20
+    strategy.splats.optimiser.overwrite("opacity_logits", logits)
+    for i in range(5):
+        step(strategy, i)
+    assert len(strategy.splats) == left
+
+
 def left_of_large(largest, start=3, radius=6, factor=1):
     """How many of 30 stay of which 15 have that radius, in a picture of 4 x 2 times a factor."""
     strategy = strategy_of(schedule=Schedule(range(0), prune_large_from=start, largest=largest))
