@@ -34,7 +34,6 @@ _CLASHES = (
     _Clash("--print-board", "--demo", (), "both say what is to be made"),
     _Clash("--out", "--info", (), "what a file holds is printed, and nothing is written"),
     _Clash("--fps", "--format", ("png",), "pictures have no speed"),
-    _Clash("--frames", "--path", ("train", "test"), "one picture is made of each of these views"),
 )
 
 
@@ -49,11 +48,6 @@ class _Need(NamedTuple):
 NEEDS_OF_HULL = (
     _Need("--sphere-centre", "--kind", ("unit-sphere",)),
     _Need("--sphere-radius", "--kind", ("unit-sphere",)),
-)
-NEEDS_OF_MASKS_OUT = (
-    _Need("--cameras", "--masks-out", ()),
-    _Need("--frames", "--cameras", ("orbit",)),
-    _Need("--overwrite", "--masks-out", ()),
 )
 NEEDS_OF_PREPARE = (_Need("--paper", "--print-board", ()),)
 NEEDS_OF_TABLE = (_Need("--slurm", "--executor", ("slurm",)),)

@@ -89,3 +89,46 @@ def test_fractions_are_no_angles():
     (found,) = (f for f in check(normalised, masks).findings if f.sure == "certain")
     assert found.kind == "principal" and "so are fx and fy" in found.todo
     assert not may_be_other_units(normalised)
+
+
+def _small(focal, count=6):
+    """The same at a third of the size, in which outlines hardly move."""
+    motion = turntable(count, (0.5, 1.2))[0].world_from_camera
+    right, given = np.diag([F / 3, F / 3, 1.0]), np.diag([focal, focal, 1.0])
+    right[:2, 2] = given[:2, 2] = W / 6, H / 6
+    made = [Cameras.from_matrices(K, motion, width=W // 3, height=H // 3) for K in (right, given)]
+    return made[1], ball_masks(made[0], OBJECT)
+
+
+def test_the_check_says_how_far_focal_lengths_are_open():
+    def width(cameras, masks):
+        low, high = check(cameras, masks).focal_range
+        assert 0.5 <= low <= 1 <= high <= 2
+        return high / low
+
+    # Small pictures leave more of it open than large ones.
+    assert width(*_small(F / 3)) > width(*_capture((F, F))) and width(*_small(F / 3)) >= 1.25
+
+
+def test_sound_small_pictures_are_not_taken_for_degrees(caplog):
+    cameras, masks = _small(F / 3)
+    with caplog.at_level(logging.WARNING):
+        SMALL.carve(cameras, masks)
+    assert "in degrees across" not in caplog.text
+    assert not check(cameras, masks).findings
+
+
+def test_degrees_in_small_pictures_are_told_faintly(caplog):
+    """They move clean outlines by less than those of usual masks are off: a warning, and no refusal."""
+    motion, w, h, f = turntable(6, (0.5, 1.2))[0].world_from_camera, 64, 48, 66.0
+    degrees = np.degrees(2 * np.arctan(w / 2 / f))
+    right, given = (
+        Cameras.from_matrices(np.array([[x, 0, w / 2], [0, x, h / 2], [0, 0, 1]]), motion, width=w, height=h)
+        for x in (f, degrees)
+    )
+    masks = ball_masks(right, OBJECT)
+    with caplog.at_level(logging.WARNING):
+        assert SMALL.carve(given, masks).voxels
+    assert "degrees across the width" in caplog.text and "here about (66, 66)" in caplog.text
+    (found,) = (f for f in check(given, masks).findings if f.kind == "scale")
+    assert found.sure == "possible" and "degrees across the width" in found.what

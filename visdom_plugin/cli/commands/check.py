@@ -26,6 +26,8 @@ FOUND = 1
 """Exit status with findings."""
 
 
+_WIDE = (0.8, 1.25)
+"""Focal lengths that could be so much shorter, or longer, are worth a line."""
 GEOMETRY = {"axes", "centres", "disagreement", "order", "principal", "scale", "swapped", "turned", "view"}
 """Kinds of findings by which masks and cameras do not fit each other, whatever K is."""
 
@@ -103,7 +105,7 @@ def _suggest(
     scene: Scene, found: Check, names: Sequence[str], folder: Path, reading: dict[str, Any]
 ) -> dict[str, Any] | None:
     """How good the choice of views is, and a better one; None where somebody chose."""
-    from visdom_plugin.cli.suggest_views import suggest_views, unfit_views
+    from visdom_plugin.cli.evaluation.suggest_views import suggest_views, unfit_views
 
     level = logging.getLogger("datamodules")
     before = level.level
@@ -185,6 +187,8 @@ def describe_check(found: Check, names: Sequence[str], *, inverted: bool = False
             k: {n: round(float(c), 4) for n, c in zip(usable, shares, strict=True)}
             for k, shares in found.advice.covered.items()
         }
+    if found.focal_range is not None:
+        report["focal_range"] = list(found.focal_range)
     if found.fit is not None:
         from visdom_plugin.hull.checks.distance_fields import OBJECT_PX
 
@@ -264,6 +268,12 @@ def summarise_fit(report: dict[str, Any]) -> list[str]:
     lines = [report["k_why"]] if "k_why" in report else []
     if lines and not GEOMETRY.isdisjoint(f["kind"] for f in report["findings"]):
         lines = ["Which K the views allow is told once poses and intrinsics fit the masks."]
+    low, high = report.get("focal_range", (1.0, 1.0))
+    if low <= _WIDE[0] or high >= _WIDE[1]:
+        lines.append(
+            f"Focal lengths {low:g} to {high:g} times as long would fit the masks about as well, with a larger or "
+            "a smaller hull: masks do not tell whether they are right."
+        )
     if report.get("choice"):
         lines.append(report["choice"]["said"])
     if "misfit" in report:

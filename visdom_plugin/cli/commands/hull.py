@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from visdom_plugin.cli.clashes import NEEDS_OF_HULL, NEEDS_OF_MASKS_OUT, refuse_unread
+from visdom_plugin.cli.clashes import NEEDS_OF_HULL, refuse_unread
 from visdom_plugin.cli.commands.check import check_views, describe_check, summarise_fit
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
-from visdom_plugin.cli.scenes import carving_views
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.inside.config import InsideConfig
@@ -70,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(argv: Sequence[str]) -> None:
     options = tyro.cli(Options, args=list(argv), prog="visdom-hull")
-    refuse_unread(argv, (*NEEDS_OF_HULL, *NEEDS_OF_MASKS_OUT))
+    refuse_unread(argv, NEEDS_OF_HULL)
     folder = options.find_scene_folder()
     if options.out is not None and options.out.suffix.lower() not in ENDINGS:
         raise ConfigError(
@@ -221,6 +220,8 @@ def _write(path: Path, hull: Hull) -> None:
 
 def _diagnose(scene: Scene, report: dict[str, Any]) -> dict[str, Any]:
     """What the check finds, and where the hull falls short of the masks."""
+    from visdom_plugin.cli.scenes import carving_views
+
     views, masks = carving_views(scene.train)
     k = report["k"] or None if report["kind"] in ("visdom", "inside") else None
     found = describe_check(check_views(views, masks, k=k, layout=scene.source.get("layout")), views.names)

@@ -13,7 +13,7 @@ from torch import Tensor
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.causes.fault_hypotheses import QUIET_PX, Suspicion, find_causes
-from visdom_plugin.hull.checks.causes.intrinsics import find_astray, find_other_unit
+from visdom_plugin.hull.checks.causes.intrinsics import find_astray, find_other_unit, measure_focal_range
 from visdom_plugin.hull.checks.causes.pose_conventions import IN_MEMORY, PoseFaults
 from visdom_plugin.hull.checks.covisibility import (
     LEAST_K,
@@ -59,6 +59,8 @@ class Check:
     """How well the usable views fit together once the faults found are undone."""
     usable: tuple[int, ...]
     """Views that `advice` and `fit` speak of."""
+    focal_range: tuple[float, float] | None = None
+    """Factors of all focal lengths between which the masks fit about as well; None where that was not asked."""
 
 
 def check(
@@ -117,7 +119,7 @@ def check(
     turned = {v for f in inverted for v in f.views}
     turned_over = [_without(~m, unknown[i]) if i in turned else m for i, m in enumerate(own)]
     found += check_border(turned_over, names)
-    units, outlines = find_other_unit(chosen, outlines)
+    units, outlines = find_other_unit(chosen, outlines, faint=True)
     found += units
     causes, fit, left = find_causes(outlines, brief=brief, poses=poses)
     if stand_at_one_point(chosen) and not any(c.kind == "axes" for c in causes):
@@ -144,7 +146,9 @@ def check(
         found += _clustered(rest, fit, chosen)
     notes, found = _split(found)
     found.sort(key=lambda f: ("certain", "likely", "possible").index(f.sure))
-    return Check(found, notes, advice, fit, tuple(usable[left].tolist()))
+    told = brief or causes or units or fit.score > _DISAGREE_PX or left.sum() < 2
+    span = None if told else measure_focal_range(rest, fit.score)
+    return Check(found, notes, advice, fit, tuple(usable[left].tolist()), span)
 
 
 def _without(mask: np.ndarray, unknown: np.ndarray | None) -> np.ndarray:

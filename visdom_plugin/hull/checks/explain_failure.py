@@ -92,9 +92,12 @@ def explain_one_point(settings: HullSettings, cameras: Cameras, silhouettes: Sil
 def refuse_other_unit(cameras: Cameras, silhouettes: Silhouettes) -> None:
     """Raises SceneError where focal lengths in another unit than pixels explain the masks; where the masks do not
     decide, a warning tells of those that are odd."""
-    found, _ = find_other_unit(cameras, draw_outlines(cameras, silhouettes))
-    if found:
+    outlines = draw_outlines(cameras, silhouettes)
+    if found := find_other_unit(cameras, outlines)[0]:
         raise SceneError(_cause(found[0]), where="camera intrinsics", todo=found[0].todo)
+    if found := find_other_unit(cameras, outlines, faint=True)[0]:
+        log.warning("camera intrinsics: %s; %s", _cause(found[0]), found[0].todo)
+        return
     if odd := describe_suspicion(cameras):
         log.warning("camera intrinsics: %s", odd)
 

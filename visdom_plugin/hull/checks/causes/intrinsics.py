@@ -30,6 +30,13 @@ _LEAST_PX, _MOST_PX, _RATIO, _POWER = 0.004, 0.1, 0.35, 0.8
 part of it; and how much of the masks' power to contradict it must."""
 
 
+_FAINT_PX, _FAINT_RATIO = 0.0007, 0.2
+"""The same of small pictures, in which a focal length that is off by a quarter moves outlines by less than what
+usual masks are off: only clean ones tell, and then faintly."""
+_LONGER, _SHORTER = (1.1, 1.25, 1.5, 2.0), (0.9, 0.8, 0.67, 0.5)
+_QUIET_PX, _RANGE_RAYS = 0.015, 512
+
+
 class _Reading(NamedTuple):
     what: str
     todo: str
@@ -42,11 +49,14 @@ def may_be_other_units(cameras: Cameras) -> bool:
     return next(_readings(*_numbers(cameras)), None) is not None
 
 
-def find_other_unit(cameras: Cameras, outlines: Outlines) -> tuple[list[Finding], Outlines]:
+def find_other_unit(
+    cameras: Cameras, outlines: Outlines, *, faint: bool = False
+) -> tuple[list[Finding], Outlines]:
     """The finding that focal lengths are in another unit, none or one; and the outlines with that undone.
 
     Args:
         cameras: (N,) the ones of the outlines.
+        faint: also believe what moves outlines by less than usual masks are off.
     """
     # Every carve asks `may_be_other_units`; the masks are compared only then, and by OpenCV.
     from visdom_plugin.hull.checks.causes.fault_hypotheses import find_causes
@@ -59,7 +69,8 @@ def find_other_unit(cameras: Cameras, outlines: Outlines) -> tuple[list[Finding]
         return [], outlines
     rays = max(_RAYS // len(outlines), 16)
     fit = measure_coherence(outlines, rays)
-    if fit.score < _LEAST_PX:
+    loud = fit.score >= _LEAST_PX
+    if not loud and not (faint and fit.score >= _FAINT_PX):
         return [], outlines
     trials = []
     for reading in readings:
@@ -68,7 +79,8 @@ def find_other_unit(cameras: Cameras, outlines: Outlines) -> tuple[list[Finding]
         changed = replace(outlines, intrinsics=K)
         trials.append((measure_coherence(changed, rays), reading, changed))
     after, best, changed = min(trials, key=lambda trial: trial[0].score)
-    if after.score > min(_RATIO * fit.score, _MOST_PX) or after.power < _POWER * fit.power:
+    ratio = _RATIO if loud else _FAINT_RATIO
+    if after.score > min(ratio * fit.score, _MOST_PX) or after.power < _POWER * fit.power:
         return [], outlines
     # Poses with other axes look into the object's mirror image; a wide enough lens explains that, too.
     causes, left, _ = find_causes(outlines, brief=True)
@@ -84,8 +96,37 @@ def find_other_unit(cameras: Cameras, outlines: Outlines) -> tuple[list[Finding]
         f"and cameras miss each other by {misses} of the object's length in the mean in place of {before}"
     )
     todo = f"give pixels, here about ({mended[0]:.4g}, {mended[1]:.4g}): {best.todo}"
-    sure: Sure = "possible" if rivals else "likely"
+    sure: Sure = "likely" if loud and not rivals else "possible"
     return [Finding("scale", what, (), sure, 1 - after.score / fit.score, todo)], changed
+
+
+def measure_focal_range(outlines: Outlines, score: float) -> tuple[float, float]:
+    """How many times shorter and longer all focal lengths could be with masks that fit about as well.
+
+    Of cameras that look at one point from afar, another focal length makes the hull larger or smaller and hardly
+    moves it in any view. What tells is perspective alone, and in small pictures it stays below what rounding to
+    pixels and the masks' own errors amount to.
+
+    Args:
+        score: misfit as given, in pixels of the fields.
+
+    Returns:
+        the smallest factor, at least 0.5, and the largest, at most 2; 1 for none.
+    """
+    from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
+
+    limit, rays = max(_QUIET_PX, 2 * score), max(_RANGE_RAYS // len(outlines), 16)
+    reached = []
+    for factors in (_SHORTER, _LONGER):
+        last = 1.0
+        for factor in factors:
+            K = outlines.intrinsics.copy()
+            K[:, [0, 1], [0, 1]] *= factor
+            if measure_coherence(replace(outlines, intrinsics=K), rays, power=False).score > limit:
+                break
+            last = factor
+        reached.append(last)
+    return reached[0], reached[1]
 
 
 def describe_suspicion(cameras: Cameras) -> str | None:

@@ -11,7 +11,7 @@ from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
 from tests.datamodules.layouts.layout_writers import write_colmap
 from visdom_plugin.cli.commands.check import main
-from visdom_plugin.cli.suggest_views import pick_apart
+from visdom_plugin.cli.evaluation.suggest_views import pick_apart
 
 
 @pytest.fixture(scope="module")
