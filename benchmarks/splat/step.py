@@ -1,6 +1,6 @@
 """Time of one training step of Gaussian splatting on the CPU, against a dense torch rasteriser in the same run.
 
-    python benchmarks/splat/step.py [--repeats 15]
+    python benchmarks/splat/step.py [--repeats 15] [--sizes 200000x800]
 
 A step is forward, 0.8 L1 + 0.2 (1 - SSIM), backward, and torch's fused Adam over all parameters, harmonics of
 degree 3. The Gaussians cover a sphere that fills most of the image. Times are the least of the repeats.
@@ -15,6 +15,7 @@ import argparse
 import itertools
 import math
 import os
+import resource
 import time
 
 # As visdom-train asks of torch for splats: its threads else spin on the cores that the kernels need.
@@ -119,23 +120,29 @@ def time_step(n: int, size: int, repeats: int, reference: bool) -> list[float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=15)
-    repeats = parser.parse_args().repeats
+    parser.add_argument("--sizes", nargs="+", metavar="NxP", help="N Gaussians on P x P pixels")
+    arguments = parser.parse_args()
+    repeats = arguments.repeats
+    sizes = [tuple(map(int, size.split("x"))) for size in arguments.sizes or ()] or SIZES
     start = time.perf_counter()
     warm_up()
     print(f"kernels ready after {time.perf_counter() - start:.1f} s; {torch.get_num_threads()} threads")
-    n, size = DENSE_SIZE
-    reference = time_step(n, size, max(2, repeats // 5), reference=True)
-    pairs = n * size * size
-    print(f"dense torch, {n} Gaussians, {size} x {size}: {reference[-1]:.0f} ms per step")
-    print(
-        f"{'Gaussians':>9} {'image':>9} " + "".join(f"{p:>10}" for p in (*PARTS, "step")) + "   dense / step"
-    )
-    for n, size in SIZES:
+    rows = []
+    for n, size in sizes:
         times = time_step(n, size, repeats, reference=False)
-        scaled = reference[-1] * n * size * size / pairs
+        # The most the process held so far, in MB where ru_maxrss counts kilobytes (Linux).
+        rows.append((n, size, times, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024))
+    n, size = DENSE_SIZE
+    reference = time_step(n, size, max(2, repeats // 5), reference=True)[-1]
+    pairs = n * size * size
+    print(f"dense torch, {n} Gaussians, {size} x {size}: {reference:.0f} ms per step")
+    columns = "".join(f"{part:>10}" for part in (*PARTS, "step", "most"))
+    print(f"{'Gaussians':>9} {'image':>9} {columns}   dense / step")
+    for n, size, times, memory in rows:
+        scaled = reference * n * size * size / pairs
         note = "measured" if (n, size) == DENSE_SIZE else "scaled by pairs"
         cells = "".join(f"{t:7.1f} ms" for t in times)
-        print(f"{n:9d} {size:4d}x{size:<4d} {cells}   {scaled / times[-1]:.0f} x ({note})")
+        print(f"{n:9d} {size:4d}x{size:<4d} {cells} {memory:6d} MB   {scaled / times[-1]:.0f} x ({note})")
 
 
 if __name__ == "__main__":
