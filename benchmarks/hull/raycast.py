@@ -13,7 +13,8 @@ from carve import capture, least
 
 from visdom_plugin.geometry.cameras import rays_of
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.hull.queries.raycast import build_bricks, cast, cast_with_torch, depth_and_silhouette
+from visdom_plugin.hull.queries.bricks import build_bricks
+from visdom_plugin.hull.queries.raycast import cast, cast_with_torch, depth_and_silhouette
 
 
 def main() -> None:

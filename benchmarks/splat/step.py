@@ -18,8 +18,8 @@ import os
 import resource
 import time
 
-# As visdom-train asks of torch for splats: its threads else spin on the cores that the kernels need.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# As the commands ask of torch: its threads else spin on the cores that the kernels need.
+os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 import torch
 

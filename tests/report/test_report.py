@@ -10,7 +10,7 @@ import pytest
 
 from tests import browser
 from visdom_plugin.cli.commands import report, train
-from visdom_plugin.cli.reports import repeat_command
+from visdom_plugin.cli.output.reports import repeat_command
 from visdom_plugin.figures.contact_sheet import colour_depth
 
 
@@ -97,7 +97,7 @@ def test_bad_input_gets_one_clear_line(fakes, tmp_path, capsys):
 
 
 def test_a_report_that_fails_leaves_the_run_finished(fakes, monkeypatch, caplog):
-    from visdom_plugin.cli import reports
+    from visdom_plugin.cli.output import reports
 
     def broken(*_, **__):
         raise OSError("no room")

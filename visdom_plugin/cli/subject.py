@@ -97,7 +97,7 @@ def open_point_cloud(path: Path, options: SceneOptions, device: str, *, test: bo
     """
     import torch
 
-    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.cli.scenes import open_scene
     from visdom_plugin.export.splat_files import read_splats
     from visdom_plugin.geometry.local_frame import local_origin, mean_distance

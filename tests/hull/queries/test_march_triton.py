@@ -10,7 +10,8 @@ import torch
 
 PROGRAM = """
 import torch
-from visdom_plugin.hull.queries.raycast import build_bricks, march_with_torch
+from visdom_plugin.hull.queries.bricks import build_bricks
+from visdom_plugin.hull.queries.raycast import march_with_torch
 from visdom_plugin.hull.queries.march_triton import march
 
 device = "cuda" if torch.cuda.is_available() else "cpu"

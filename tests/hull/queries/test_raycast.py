@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from tests.hull.balls import ring
 from visdom_plugin.hull.hull import Hull
-from visdom_plugin.hull.queries.raycast import build_bricks, cast, cast_with_torch, depth_and_silhouette
+from visdom_plugin.hull.queries.bricks import build_bricks
+from visdom_plugin.hull.queries.raycast import cast, cast_with_torch, depth_and_silhouette
 
 
 def slow_cast(hull: Hull, origins, directions):

@@ -49,7 +49,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         return leave_one_out.main([word for word in argv if word != "--leave-one-out"])
     options = tyro.cli(Options, args=argv, prog="visdom-eval")
 
-    from visdom_plugin.cli.report import say, show_oracle, show_result
+    from visdom_plugin.cli.output.terminal import say, show_oracle, show_result
     from visdom_plugin.cli.runs import open_run
     from visdom_plugin.training.run import evaluate_again
 

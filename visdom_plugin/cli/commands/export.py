@@ -330,7 +330,7 @@ def _carve(views: Any) -> Hull | None:
 
 
 def _say(options: Options, text: str) -> None:
-    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.output.terminal import say
 
     if not options.quiet:
         say(text)

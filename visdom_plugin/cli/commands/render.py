@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _render(argv: Sequence[str]) -> None:
     options = _check(tyro.cli(Options, args=argv, prog="visdom-render"))
 
-    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.figures.videos import name_codec
     from visdom_plugin.geometry.camera_paths import framed
     from visdom_plugin.training.progress import Progress

@@ -63,7 +63,7 @@ def _draw_again(run: Path, data: Path | None, device: str) -> None:
         CheckpointError: it is no run, has not finished, or its scene is not there.
     """
     from visdom_plugin.cli.commands.check import find_briefly
-    from visdom_plugin.cli.reports import report_finished
+    from visdom_plugin.cli.output.reports import report_finished
     from visdom_plugin.cli.runs import open_run
     from visdom_plugin.errors import CheckpointError
     from visdom_plugin.report.page import read_gathered

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -16,18 +15,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     return entry.run(_train, argv)
 
 
-def _share_cores(config: object) -> None:
-    """Before torch is imported, asks its threads to sleep between operations where the method is one of splats.
-
-    They otherwise spin for milliseconds, on the cores that this package's kernels need meanwhile. Methods that
-    call torch all the time, as fields do, are faster with the spinning.
-    """
-    from visdom_plugin.splat.set_config import GaussianSetConfig
-
-    if isinstance(config, GaussianSetConfig) and "torch" not in sys.modules:
-        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
-
 def _train(argv: Sequence[str]) -> None:
     request = options.parse(argv)
     common = request.common
@@ -35,11 +22,10 @@ def _train(argv: Sequence[str]) -> None:
         sys.stdout.write(options.dump(request))
         return
     common.find_scene_folder()
-    _share_cores(request.config)
     device = options.resolve_device(common.device)
 
     from visdom_plugin.cli.commands.check import warn_of_faults
-    from visdom_plugin.cli.report import say, show_result
+    from visdom_plugin.cli.output.terminal import say, show_result
     from visdom_plugin.cli.runs import default_run_dir, train_as_asked
     from visdom_plugin.cli.scenes import open_scene
     from visdom_plugin.scene import describe_masks
@@ -60,7 +46,7 @@ def _train(argv: Sequence[str]) -> None:
         from functools import partial
 
         from visdom_plugin.cli.commands.check import find_briefly
-        from visdom_plugin.cli.reports import report_finished
+        from visdom_plugin.cli.output.reports import report_finished
 
         on_finished = partial(report_finished, scene=scene, run_dir=folder, device=device, check=find_briefly)
     with watching(folder) if common.view else nullcontext():

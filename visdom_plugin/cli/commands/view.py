@@ -60,7 +60,7 @@ def _view(argv: Sequence[str]) -> None:
     from visdom_plugin.viewer.serve import choose_port, describe_address
 
     choose_port(options.host, options.port)
-    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.viewer.app import Viewer
 
     subject = open_shown(options)

@@ -84,7 +84,7 @@ def main(argv: Sequence[str]) -> int:
         return 0
     device = options.resolve_device(common.device)
 
-    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.cli.scenes import open_scene
 
     scene = open_scene(common.data, **options.read_options(common), fill=False, hold_out=False)
@@ -165,7 +165,7 @@ def run_folds(request: options.Request, scene: Scene, folder: Path, *, device: s
         ConfigError, CheckpointError, PluginError: settings, folder or method will not do, with or without a view.
     """
     from visdom_plugin.atomic_files import write_json
-    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.cli.runs import train_as_asked
     from visdom_plugin.figures.contact_sheet import draw_sheet, picture_names, write_png
     from visdom_plugin.scene import hold_out
@@ -230,7 +230,7 @@ def show_summary(summary: Summary, folder: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from visdom_plugin.cli.report import show_files
+    from visdom_plugin.cli.output.terminal import show_files
 
     console = Console(soft_wrap=True)
     shown = [column for column in COLUMNS if summary["mean"].get(column[0]) is not None] or COLUMNS[:1]

@@ -53,7 +53,7 @@ def _measure(argv: Sequence[str]) -> None:
         sys.stdout.write(options.dump(request))
         return
 
-    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.cli.runs import default_run_dir
     from visdom_plugin.cli.scenes import open_scene
     from visdom_plugin.training.hull_run.run import carve_run

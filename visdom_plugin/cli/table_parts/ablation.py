@@ -175,7 +175,7 @@ def _open(spec: TableSpec, options: AblationOptions) -> Scene:
 def _run_folds(spec: TableSpec, scene: Scene, options: AblationOptions, out: Path, runs: Path) -> int:
     """The same table with every training view held out in turn; the views stand as the table's scenes."""
     from visdom_plugin.cli.evaluation import leave_one_out as folds
-    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.tables.report.write import write_all
     from visdom_plugin.training.runs.run_directory import read_record
 
@@ -243,7 +243,7 @@ def _request(row: Row, budget: str, common: Common, note: str) -> Request:
 
 def _draw(results: Results, views: int, photographs: Views, out: Path, quiet: bool) -> None:
     """Writes the figure of one number of views, seed by seed averaged numbers, the first seed's pictures."""
-    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.cli.table_parts.ablation_figure import draw_figure
     from visdom_plugin.figures.contact_sheet import write_png
 

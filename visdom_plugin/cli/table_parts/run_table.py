@@ -80,7 +80,7 @@ def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | Non
         the exit status, and what there is of the runs; None in place of it when they were only listed, where the
         status is 1 for scenes that cannot be read.
     """
-    from visdom_plugin.cli.report import say
+    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.cli.table_parts.workshop import make_workshop
     from visdom_plugin.tables.report.summary import summarise
     from visdom_plugin.tables.report.write import write_all

@@ -1,8 +1,7 @@
 """Where rays enter and leave a hull, and what a camera sees of it: voxel traversal, without a mesh.
 
-The grid is cut into bricks of 4 x 4 x 4 voxels, 64 bits each, with the edge of the largest empty cube of bricks
-ahead of every brick, for each of the eight octants a ray may go to. Empty space is crossed in such cubes (after
-sphere tracing in distance fields); inside a brick that holds something the ray crosses empty blocks of 2 x 2 x 2
+Empty space is crossed in the cubes of bricks that `bricks` looked up ahead (after sphere tracing in distance
+fields); inside a brick that holds something the ray crosses empty blocks of 2 x 2 x 2
 voxels, and goes from voxel to voxel (Amanatides and Woo 1987). Crossings are exact: t at the plane between voxels.
 
 A step of any kind leaves a box by the same arithmetic, without a branch, in a grid mirrored so that no ray goes
@@ -23,9 +22,8 @@ from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.hull import Hull, occupied_box
+from visdom_plugin.hull.queries.bricks import BRICK, build_bricks
 
-_BRICK = 4
-_FARTHEST = 255
 _PACK = 256
 """Rays that walk together; their state, 30 KiB, stays in the first cache."""
 _GRAIN = 16 * _PACK
@@ -44,63 +42,6 @@ class Crossing(NamedTuple):
     """(...) last exit, same unit; 0 for a miss."""
     hit: Tensor
     """(...) bool."""
-
-
-class Bricks(NamedTuple):
-    """An occupancy grid in bricks."""
-
-    bits: np.ndarray
-    """(A, B, C) uint64, bit x + 4 y + 16 z of a brick is voxel (x, y, z) in it."""
-    ahead: np.ndarray
-    """(8, A, B, C) uint8 edge of the largest empty cube of bricks that has this one in its corner, at most 255. In
-    octant i + 2 j + 4 k it goes to smaller x if i, smaller y if j, smaller z if k; it may leave the grid."""
-
-
-@kernel()
-def _pack(begin: int, end: int, grid: np.ndarray, bits: np.ndarray) -> None:
-    nx, ny, nz = grid.shape
-    for a in range(begin, end):
-        for x in range(4 * a, min(4 * a + 4, nx)):
-            for y in range(ny):
-                base = (x & 3) + 4 * (y & 3)
-                for z in range(nz):
-                    if grid[x, y, z]:
-                        bits[a, y >> 2, z >> 2] |= np.uint64(1) << np.uint64(base + 16 * (z & 3))
-
-
-@kernel()
-def _look_ahead(begin: int, end: int, bits: np.ndarray, ahead: np.ndarray) -> None:
-    """Largest empty cubes by dynamic programming: one more than the smallest of the seven bricks ahead."""
-    na, nb, nc = bits.shape
-    outside = np.full(nc, _FARTHEST - 1, np.uint8)
-    for octant in range(begin, end):
-        i, j, k = 1 - 2 * (octant & 1), 1 - 2 * (octant >> 1 & 1), 1 - 2 * (octant >> 2)
-        cubes = ahead[octant]
-        for p in range(na):
-            a = na - 1 - p if i > 0 else p
-            for q in range(nb):
-                b = nb - 1 - q if j > 0 else q
-                row, word = cubes[a, b], bits[a, b]
-                beside = cubes[a + i, b] if p > 0 else outside
-                below = cubes[a, b + j] if q > 0 else outside
-                across = cubes[a + i, b + j] if p > 0 and q > 0 else outside
-                # The smallest of the four bricks one step ahead along z, from the step before.
-                before = np.uint8(_FARTHEST - 1)
-                for r in range(nc):
-                    c = nc - 1 - r if k > 0 else r
-                    sides = min(min(beside[c], below[c]), across[c])
-                    best = np.uint8(min(min(sides, before), _FARTHEST - 1) + 1)
-                    row[c] = np.uint8(0) if word[c] else best
-                    before = np.uint8(min(sides, row[c]))
-
-
-def build_bricks(occupancy: np.ndarray) -> Bricks:
-    """Bricks of an (X, Y, Z) bool grid."""
-    shape = tuple(-(-n // _BRICK) for n in occupancy.shape)
-    bits, ahead = np.zeros(shape, np.uint64), np.empty((8, *shape), np.uint8)
-    parallel_for(_pack, shape[0], 1, occupancy.view(np.uint8), bits)
-    parallel_for(_look_ahead, 8, 1, bits, ahead)
-    return Bricks(bits, ahead)
 
 
 @kernel()
@@ -361,14 +302,14 @@ def march_with_torch(
     o, d, t, end = o[rays], d[rays], begin[rays], end[rays]
     voxel = torch.floor(o + t[:, None] * d).long().clamp_min(0).minimum(size - 1)
     while len(rays):
-        brick = voxel // _BRICK
+        brick = voxel // BRICK
         free = distance[tuple(brick.T)].long()
         stop = (free == 0) & grid[tuple(voxel.T)]
         found[rays[stop]] = t[stop]
         # The empty cube around the voxel: of bricks, or the voxel alone in a brick that holds something.
         single = (free == 0)[:, None]
-        low = torch.where(single, voxel, _BRICK * (brick - free[:, None] + 1))
-        high = torch.where(single, voxel + 1, _BRICK * (brick + free[:, None]))
+        low = torch.where(single, voxel, BRICK * (brick - free[:, None] + 1))
+        high = torch.where(single, voxel + 1, BRICK * (brick + free[:, None]))
         planes = torch.where(d == 0, torch.inf, (torch.where(d > 0, high, low) - o) / d)
         out = planes.amin(-1)
         t = torch.maximum(t, out)

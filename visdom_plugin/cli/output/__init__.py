@@ -1,0 +1,1 @@
+"""What commands say and make of finished runs: lines on the terminal, reports."""
