@@ -64,6 +64,8 @@ class Preset:
     """"sampler" or "gaussian"; by default told by the settings in the config's field `vd`."""
     standard: Settings | None = None
     """Config dataclass for at most ten minutes on two CPU cores; None where there is nothing between the two."""
+    standard_views: int = 0
+    """Fewest views from which `standard` was seen to gain over `quick`."""
 
     def __post_init__(self) -> None:
         if self.hook is None:
@@ -158,6 +160,8 @@ class MethodSpec:
     """One line for a variant, in place of the one made from `description`."""
     standard: Settings | None = None
     """Settings between quick and full: at most ten minutes on two CPU cores at 400 x 400."""
+    standard_views: int = 0
+    """Fewest views from which `standard` was seen to gain over `quick`."""
     aliases: tuple[str, ...] = ()
     """Other names for it."""
 
@@ -224,7 +228,9 @@ class MethodSpec:
             quick = self._vary(self.quick, suffix, self.variants, self.quick_variants)
             standard = None if self.standard is None else self._vary(self.standard, suffix, self.variants)
             full = self._vary(self.full, suffix, self.variants)
-            made[name] = Preset(name, text, self.target, quick, full, self.hook, standard)
+            made[name] = Preset(
+                name, text, self.target, quick, full, self.hook, standard, self.standard_views
+            )
         for alias in self.aliases:
             made |= {name.replace(self.name, alias, 1): p for name, p in list(made.items()) if name == p.name}
         return made

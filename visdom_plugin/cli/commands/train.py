@@ -37,6 +37,11 @@ def _train(argv: Sequence[str]) -> None:
         say(
             f"{request.preset.name} on {data} ({scene.name}): {len(scene.train)} training views, {request.note}"
         )
+        if common.budget == "standard" and len(scene.train) < request.preset.standard_views:
+            say(
+                f"budget standard gains from {request.preset.standard_views} views on; with {len(scene.train)}, "
+                "--budget quick was seen to be better, and is faster"
+            )
         for line in (*describe_masks(scene.train), *scene.notes):
             say(f"data: {line}")
         say(f"run directory: {folder}")
