@@ -157,11 +157,21 @@ def test_a_dry_run_writes_nothing(small, tmp_path, capsys):
         (["small.yaml", "--downscale", "nan"], "1 or more"),
         (["small.yaml", "--downscale", "inf"], "1 or more"),
         (["small.yaml", "--seeds", "0", "0"], "different values, not 0, 0"),
+        (["small.yaml", "--root", "mip=."], "no data root 'mip'"),
+        (["small.yaml", "--views", "999"], "must be 2 to 16"),
+        (["--views", "4"], "no table is named"),
     ],
 )
 def test_a_users_mistake_ends_with_2_and_runs_nothing(small, tmp_path, capsys, words, said, dry):
     assert table.main([*words, *dry]) == 2
     assert said in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["small.yaml"]
+
+
+def test_a_gpu_that_is_not_there_is_said_once_and_before_any_run(small, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert table.main(["small.yaml", "--device", "cuda"]) == 2
+    assert capsys.readouterr().err.count("no CUDA device") == 1
     assert [p.name for p in tmp_path.iterdir()] == ["small.yaml"]
 
 

@@ -60,8 +60,12 @@ class DataHasher:
             SceneError: for a scene that cannot be read.
             ConfigError: for a reading that does not fit the scene.
         """
-        found, digest = None, self._once("built-in", hash_built_in) if folder is None else ""
-        if folder is not None:
+        if folder is None:
+            from datamodules.synthetic.config import SyntheticConfig
+
+            SyntheticConfig(train_views=int(str(reading["views"]))).check()
+            found, digest = None, self._once("built-in", hash_built_in)
+        else:
             key = json.dumps([str(folder), dict(reading)], sort_keys=True)
             found = self._once(key, lambda: self._look(folder, reading))
             digest = found.digest
