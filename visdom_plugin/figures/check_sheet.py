@@ -15,9 +15,9 @@ import torch
 from visdom_plugin.figures.canvas import Canvas
 from visdom_plugin.hull.carving.carve import carve_silhouettes
 from visdom_plugin.hull.carving.votes import gather_silhouettes
-from visdom_plugin.hull.checks.distance_fields import draw_outlines, is_known
-from visdom_plugin.hull.checks.silhouette_consistency import TOLERANCE_PX, march_rays
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.outlines.distance_fields import draw_outlines, is_known
+from visdom_plugin.hull.outlines.silhouette_consistency import TOLERANCE_PX, march_rays
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 
 if TYPE_CHECKING:

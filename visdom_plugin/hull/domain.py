@@ -93,7 +93,7 @@ class VisibleDomain(HullSettings):
         settings = self._in_bounds(cameras)
         if self.k == "auto" and self.kind != "released-go":
             from visdom_plugin.hull.checks.covisibility import advise_k
-            from visdom_plugin.hull.checks.distance_fields import draw_outlines
+            from visdom_plugin.hull.outlines.distance_fields import draw_outlines
 
             advice = advise_k(draw_outlines(cameras, silhouettes))
             log.info("k=auto takes %s", advice.why)

@@ -21,6 +21,8 @@ class Wording(NamedTuple):
     """What to do about poses in another convention; "" leaves it to what was found."""
     sheet: str
     """Where views and outlines are shown."""
+    refine: str
+    """How the pose of one view is refined; {view} stands for its position."""
 
 
 LIBRARY = Wording(
@@ -30,6 +32,7 @@ LIBRARY = Wording(
     more_views="use three views or more",
     poses="",
     sheet="draw masks and hull over the photographs",
+    refine="refine its pose: visdom_plugin.hull.refine.poses.refine_poses(cameras, masks, free=[{view}])",
 )
 COMMANDS = Wording(
     set_k="--k {k}",
@@ -38,6 +41,8 @@ COMMANDS = Wording(
     more_views="use more views: --views 3 or more",
     poses="change the poses in the scene's file: `visdom-check DIR` tells how",
     sheet="look at the contact sheet (visdom-check DIR --out OUT)",
+    refine="refine the poses of a COLMAP model or a transforms.json: visdom-prepare PHOTOS --poses POSES --masks "
+    "MASKS --refine-poses --out SCENE",
 )
 _current: ContextVar[Wording] = ContextVar("wording", default=LIBRARY)
 

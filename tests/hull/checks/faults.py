@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -205,13 +205,18 @@ def focal_one(c: Capture, v: int) -> Fault:
     return Fault(_intrinsics(c, v, _FOCAL(2)), "view", (v,))
 
 
+def turned_about(c: Capture, v: int, axis: Sequence[float], degrees: float) -> Capture:
+    """One camera turned about an axis of its own."""
+    half = math.radians(degrees) / 2
+    unit = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0)
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = matrix_from_quaternion(torch.cat([torch.tensor([math.cos(half)]), math.sin(half) * unit]))
+    return _pose(c, v, lambda m: m @ turn)
+
+
 def turned(c: Capture, v: int) -> Fault:
     """One camera turned by 5 degrees about a slanted axis."""
-    half = math.radians(5) / 2
-    axis = torch.nn.functional.normalize(torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64), dim=0)
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[:3, :3] = matrix_from_quaternion(torch.cat([torch.tensor([math.cos(half)]), math.sin(half) * axis]))
-    return Fault(_pose(c, v, lambda m: m @ turn), "view", (v,))
+    return Fault(turned_about(c, v, (1.0, -1.0, 0.5), 5), "view", (v,))
 
 
 def moved(c: Capture, v: int) -> Fault:

@@ -18,16 +18,16 @@ from visdom_plugin.geometry.cameras import Cameras, project
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.check import check
 from visdom_plugin.hull.checks.covisibility import advise_k, measure_spread
-from visdom_plugin.hull.checks.distance_fields import draw_outlines, signed_distance
 from visdom_plugin.hull.checks.mask_checks import border_contact, count_specks
-from visdom_plugin.hull.checks.silhouette_consistency import (
+from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.outlines.distance_fields import draw_outlines, signed_distance
+from visdom_plugin.hull.outlines.silhouette_consistency import (
     CAP_PX,
     SLACK_PX,
     choose_pixels,
     march_rays,
     measure_coherence,
 )
-from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.wording import for_commands
 
 BOX = ((-0.4, -0.5, -0.3), (0.5, 0.3, 0.4))

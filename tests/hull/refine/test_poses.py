@@ -10,9 +10,9 @@ from tests.geometry.pointing import pointing_error
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import gather_silhouettes
-from visdom_plugin.hull.checks.distance_fields import Outlines, draw_outlines
-from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
-from visdom_plugin.hull.refine.poses import RefineConfig, _rotations, refine_poses
+from visdom_plugin.hull.outlines.distance_fields import Outlines, draw_outlines
+from visdom_plugin.hull.outlines.silhouette_consistency import measure_coherence
+from visdom_plugin.hull.refine.poses import RefineConfig, refine_poses, rotations
 from visdom_plugin.hull.refine.rays import assemble, cost_of, find_points, outline_pixels, pack
 
 
@@ -43,7 +43,7 @@ def points(outlines):
 def moved(outlines: Outlines, change: np.ndarray, distance: np.ndarray) -> Outlines:
     turns, moves = change.reshape(len(outlines), 2, 3).transpose(1, 0, 2)
     return Outlines(
-        outlines.rotations @ _rotations(turns),
+        outlines.rotations @ rotations(turns),
         outlines.centres + distance[:, None] * moves,
         outlines.intrinsics,
         outlines.fields,
@@ -160,7 +160,7 @@ def test_masks_that_agree_change_nothing():
 def test_one_view_that_is_off_is_turned_back_by_as_much():
     true = scene(8, 0.0, size=200).train
     motion = true.cameras.world_from_camera.clone()
-    turn = torch.as_tensor(_rotations(np.radians([[0.6, -1.2, 0.5]]))[0])
+    turn = torch.as_tensor(rotations(np.radians([[0.6, -1.2, 0.5]]))[0])
     motion[3, :3, :3] = motion[3, :3, :3] @ turn
     cameras = Cameras(true.cameras.intrinsics, motion, true.cameras.width, true.cameras.height)
     found = refine_poses(cameras, true.masks, free=[3])

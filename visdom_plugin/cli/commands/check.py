@@ -190,7 +190,7 @@ def describe_check(found: Check, names: Sequence[str], *, inverted: bool = False
     if found.focal_range is not None:
         report["focal_range"] = list(found.focal_range)
     if found.fit is not None:
-        from visdom_plugin.hull.checks.distance_fields import OBJECT_PX
+        from visdom_plugin.hull.outlines.distance_fields import OBJECT_PX
 
         report["misfit"] = round(found.fit.score / OBJECT_PX, 6)
         report["constraint"] = round(found.fit.power / OBJECT_PX, 6)
@@ -198,6 +198,7 @@ def describe_check(found: Check, names: Sequence[str], *, inverted: bool = False
 
 
 def _plain(finding: Finding, names: Sequence[str], inverted: bool) -> dict[str, Any]:
+    turned = {} if finding.turned_deg is None else {"turned_deg": finding.turned_deg}
     return {
         "kind": finding.kind,
         "what": finding.what,
@@ -205,6 +206,7 @@ def _plain(finding: Finding, names: Sequence[str], inverted: bool) -> dict[str, 
         "sure": finding.sure,
         "evidence": round(float(finding.evidence), 6),
         "todo": _advise(finding, len(names), inverted),
+        **turned,
     }
 
 

@@ -15,6 +15,7 @@ from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.causes.fault_hypotheses import QUIET_PX, Suspicion, find_causes
 from visdom_plugin.hull.checks.causes.intrinsics import find_astray, find_other_unit, measure_focal_range
 from visdom_plugin.hull.checks.causes.pose_conventions import IN_MEMORY, PoseFaults
+from visdom_plugin.hull.checks.causes.turned_view import Turn, measure_turn
 from visdom_plugin.hull.checks.covisibility import (
     LEAST_K,
     LOST,
@@ -24,7 +25,6 @@ from visdom_plugin.hull.checks.covisibility import (
     measure_spread,
 )
 from visdom_plugin.hull.checks.degenerate import stand_at_one_point
-from visdom_plugin.hull.checks.distance_fields import OBJECT_PX, Outlines, draw_outlines, turn_over
 from visdom_plugin.hull.checks.findings import Finding, Name, Sure
 from visdom_plugin.hull.checks.mask_checks import (
     check_border,
@@ -33,8 +33,9 @@ from visdom_plugin.hull.checks.mask_checks import (
     find_repeated,
     look_inverted,
 )
-from visdom_plugin.hull.checks.silhouette_consistency import Coherence, measure_coherence
 from visdom_plugin.hull.foreign import to_numpy
+from visdom_plugin.hull.outlines.distance_fields import OBJECT_PX, Outlines, draw_outlines, turn_over
+from visdom_plugin.hull.outlines.silhouette_consistency import Coherence, measure_coherence
 from visdom_plugin.hull.wording import wording
 
 CLUSTERED_DEGREES = 60.0
@@ -131,7 +132,11 @@ def check(
         return Check(found, notes, None, fit, tuple(usable.tolist()))
     repeated, causes = _join(repeated, causes, usable, names)
     found += repeated
-    found += [_cause(c, usable, names, poses) for c in causes]
+    single = len(causes) == 1 and not (brief or inverted or units)
+    turn = measure_turn(outlines, causes[0]) if single else None
+    if turn is not None:
+        causes = [causes[0]._replace(detail="")]
+    found += [_cause(c, usable, names, poses, turn) for c in causes]
     ambiguous = any(c.rivals for c in causes)
     if fit.score > _DISAGREE_PX and not ambiguous:
         found.append(_disagreement(fit, usable[left], names))
@@ -288,7 +293,9 @@ _TODO = {
 }
 
 
-def _cause(cause: Suspicion, usable: np.ndarray, names: Name, poses: PoseFaults) -> Finding:
+def _cause(
+    cause: Suspicion, usable: np.ndarray, names: Name, poses: PoseFaults, turn: Turn | None
+) -> Finding:
     views = tuple(int(usable[v]) for v in cause.views)
     after = f"{_share(cause.after)} of the object's length in the mean"
     gain = f"undone, masks and cameras miss each other by {after} in place of {_share(cause.before)}"
@@ -314,7 +321,13 @@ def _cause(cause: Suspicion, usable: np.ndarray, names: Name, poses: PoseFaults)
     sure = "possible" if cause.rivals or cause.others else sure
     todo = dict(poses)[cause.detail] if cause.kind == "axes" else _TODO[cause.kind]
     alternatives = tuple(sorted({kind for kind, _, _ in cause.others}))
-    return Finding(cause.kind, f"{what}: {gain}", views, sure, 1 - ratio, todo, alternatives)
+    said = Finding(cause.kind, f"{what}: {gain}", views, sure, 1 - ratio, todo, alternatives)
+    if turn is None:
+        return said
+    what = f"{said.what}; its camera seems turned by about {turn.degrees:.1f} degrees (a small move of it, or of "
+    what += f"its mask, looks the same): turned back, all miss each other by {_share(turn.after)}"
+    todo = f"look whether its mask lies on its photograph; where it does, {wording().refine.format(view=views[0])}"
+    return said._replace(what=what, todo=f"{todo}; or leave the view out", turned_deg=round(turn.degrees, 2))
 
 
 def _disagreement(fit: Coherence, views: np.ndarray, names: Name) -> Finding:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from visdom_plugin.hull.checks.distance_fields import Outlines
 from visdom_plugin.hull.checks.findings import Name
-from visdom_plugin.hull.checks.silhouette_consistency import (
+from visdom_plugin.hull.outlines.distance_fields import Outlines
+from visdom_plugin.hull.outlines.silhouette_consistency import (
     Coherence,
     choose_pixels,
     march_rays,

@@ -22,9 +22,9 @@ from visdom_plugin.hull.checks.check import check
 from visdom_plugin.hull.checks.coverage import POOR_COVERAGE, measure_coverage
 from visdom_plugin.hull.checks.covisibility import LEAST_K, USUAL_K
 from visdom_plugin.hull.checks.degenerate import count_cameras_inside, describe_speck
-from visdom_plugin.hull.checks.distance_fields import draw_outlines
 from visdom_plugin.hull.checks.findings import Finding, Name
 from visdom_plugin.hull.hull import Hull
+from visdom_plugin.hull.outlines.distance_fields import draw_outlines
 from visdom_plugin.hull.settings import HullSettings
 from visdom_plugin.hull.wording import wording
 

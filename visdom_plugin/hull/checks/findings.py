@@ -29,6 +29,8 @@ class Finding(NamedTuple):
     """Kinds of other causes that would explain it equally well."""
     note: bool = False
     """True for what is worth knowing but harms nothing: it does not make a capture faulty."""
+    turned_deg: float | None = None
+    """Of one view: by how many degrees its camera seems to be turned, where turning it back makes it fit."""
 
 
 class Name(list[str]):

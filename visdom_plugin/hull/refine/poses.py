@@ -23,8 +23,8 @@ from torch import Tensor
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import Masks, gather_silhouettes
-from visdom_plugin.hull.checks.distance_fields import Outlines, draw_outlines
-from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
+from visdom_plugin.hull.outlines.distance_fields import Outlines, draw_outlines
+from visdom_plugin.hull.outlines.silhouette_consistency import measure_coherence
 from visdom_plugin.hull.refine.rays import Rays, assemble, cost_of, find_points, outline_pixels, pack
 
 log = logging.getLogger(__name__)
@@ -119,7 +119,7 @@ def refine_poses(
     still = Refined(cameras, zeros, zeros, before, before)
     if before <= _AGREE_PX:
         return still
-    found = _solve(outlines, config, range(len(cameras)) if free is None else free)
+    found = solve(outlines, config, range(len(cameras)) if free is None else free)
     after = measure_coherence(found, power=False).score if found else before
     if found is None or not after < before:
         return still
@@ -147,8 +147,16 @@ def _distances(outlines: Outlines) -> np.ndarray:
     return np.ones(len(outlines)) if ball is None else np.linalg.norm(outlines.centres - ball[0], axis=1)
 
 
-def _solve(outlines: Outlines, config: RefineConfig, free: Sequence[int]) -> Outlines | None:
-    """The views with the poses that fit best; None where the masks agree nowhere."""
+def solve(
+    outlines: Outlines, config: RefineConfig, free: Sequence[int], *, rays: int = _RAYS, cycles: int = _CYCLES
+) -> Outlines | None:
+    """The views with the poses that fit best; None where the masks agree nowhere.
+
+    Args:
+        free: the views whose cameras may be turned.
+        rays: of each view.
+        cycles: of hinges from soft to hard, at most.
+    """
     views = len(outlines)
     spread = np.tile(np.repeat([math.radians(config.turn_deg), config.move], 3), views)
     held = np.ones(views, bool)
@@ -156,28 +164,31 @@ def _solve(outlines: Outlines, config: RefineConfig, free: Sequence[int]) -> Out
     index = np.flatnonzero((spread > 0) & ~np.repeat(held, 6))
     distance = _distances(outlines)
     change, damping = np.zeros(6 * views), 1e-3
-    for cycle in range(_CYCLES):
+    level = logging.INFO if len(free) > 1 else logging.DEBUG
+    for cycle in range(cycles):
         largest = 0.0
         for softness in _SOFTNESS_PX:
             ball = measure_coherence(outlines, 128, power=False).ball
             if ball is None:
                 return None
-            view, uv = outline_pixels(outlines, _RAYS)
-            rays, _ = find_points(pack(outlines), view, uv, ball)
-            if not len(rays.view):
+            view, uv = outline_pixels(outlines, rays)
+            points, _ = find_points(pack(outlines), view, uv, ball)
+            if not len(points.view):
                 return None
             weight = _WORDS * views / len(view) / _SPREAD_PX**2
             before = change
             for _ in range(_STEPS):
-                tried = _step(outlines, rays, distance, softness, weight, change, spread, index, damping)
+                tried = _step(outlines, points, distance, softness, weight, change, spread, index, damping)
                 if tried is None:
                     damping = 1e-3
                     break
-                outlines, rays, step, damping = tried
+                outlines, points, step, damping = tried
                 change = change + step
             largest = max(largest, float(np.abs(change - before).reshape(views, 6)[:, :3].max()))
         turned = math.degrees(largest)
-        log.info("poses by silhouettes: round %d of %d, turned by %.3f degrees", cycle + 1, _CYCLES, turned)
+        log.log(
+            level, "poses by silhouettes: round %d of %d, turned by %.3f degrees", cycle + 1, cycles, turned
+        )
         if turned < _ENOUGH_DEG:
             break
     return outlines
@@ -200,7 +211,7 @@ def _step(
         turns, moves = step.reshape(views, 2, 3).transpose(1, 0, 2)
         tried = replace(
             outlines,
-            rotations=outlines.rotations @ _rotations(turns),
+            rotations=outlines.rotations @ rotations(turns),
             centres=outlines.centres + distance[:, None] * moves,
         )
         # A depth is looked for anew in every round; within one it must not leap to another part of the object.
@@ -215,7 +226,7 @@ def _step(
     return None
 
 
-def _rotations(turns: np.ndarray) -> np.ndarray:
+def rotations(turns: np.ndarray) -> np.ndarray:
     """(N, 3, 3) rotations by the vectors (N, 3), in radians about their directions (Rodrigues)."""
     angle = np.linalg.norm(turns, axis=-1)[:, None, None]
     zero = np.zeros(len(turns))

@@ -15,7 +15,7 @@ import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
-from visdom_plugin.hull.checks.distance_fields import UNKNOWN_BELOW, Outlines, is_known
+from visdom_plugin.hull.outlines.distance_fields import UNKNOWN_BELOW, Outlines, is_known
 
 _CHUNK = 64
 _FREE = -1e3

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from visdom_plugin.hull.checks.causes.pose_conventions import IN_MEMORY, PoseFaults
-from visdom_plugin.hull.checks.distance_fields import Outlines
-from visdom_plugin.hull.checks.silhouette_consistency import Coherence, measure_coherence
+from visdom_plugin.hull.outlines.distance_fields import Outlines
+from visdom_plugin.hull.outlines.silhouette_consistency import Coherence, measure_coherence
 
 QUIET_PX = 0.015
 """Mean residual (in pixels of the fields, an object is 128 long) below which nothing is looked for: sound captures
@@ -50,6 +50,8 @@ class Suspicion(NamedTuple):
     """Other views that would explain it as well, when a single view is to blame."""
     others: tuple[tuple[str, tuple[int, ...], str], ...] = ()
     """Other causes (kind, views, detail) that fit equally well."""
+    power: float = 0.0
+    """`Coherence.power` with the detail of a single view undone."""
 
 
 Change = Callable[[Outlines], Outlines]
@@ -151,8 +153,9 @@ def _best_cause(
         rest = {i: outlines.keep(np.arange(count) != i) for i in suspects}
         suspects = _closest({i: measure_coherence(rest[i], rays, power=False).score for i in suspects})
     culprit, *rivals = suspects
-    detail = "" if rivals or brief else _explain_view(outlines, culprit, rays, fit, poses)
-    return Suspicion("view", (culprit,), detail, before, float(alone[culprit]), tuple(rivals)), outlines
+    detail, power = ("", 0.0) if rivals or brief else _explain_view(outlines, culprit, rays, fit, poses)
+    misses = float(alone[culprit])
+    return Suspicion("view", (culprit,), detail, before, misses, tuple(rivals), power=power), outlines
 
 
 def _fits(changed: Outlines, enough: float, rays: int) -> Coherence | None:
@@ -231,8 +234,10 @@ def _whole_trials(
         yield _Trial("swapped", (a, b), "their masks fit when exchanged", partial(_ordered, order=order))
 
 
-def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence, poses: PoseFaults) -> str:
-    """The change that would mend one view, in words; empty for none."""
+def _explain_view(
+    outlines: Outlines, view: int, rays: int, fit: Coherence, poses: PoseFaults
+) -> tuple[str, float]:
+    """The change that would mend one view, in words, empty for none; and the power that all views have then."""
     trials = [(fault.what, change) for fault, change in zip(poses, _AXES, strict=True)]
     trials += [
         (
@@ -250,7 +255,7 @@ def _explain_view(outlines: Outlines, view: int, rays: int, fit: Coherence, pose
         # A view that is mended narrows the hull down; one that merely falls silent does not.
         if after is not None and after.power > best and np.isfinite(after.whole[view]):
             best, said = after.power, detail
-    return said
+    return said, best if said else 0.0
 
 
 def _turned(outlines: Outlines, right: np.ndarray) -> Outlines:

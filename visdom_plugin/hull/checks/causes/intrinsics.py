@@ -16,7 +16,7 @@ from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.checks.findings import Finding, Sure
 
 if TYPE_CHECKING:
-    from visdom_plugin.hull.checks.distance_fields import Outlines
+    from visdom_plugin.hull.outlines.distance_fields import Outlines
 
 LEAST, LARGEST_ANGLE, LARGEST_MM = 5.0, 170.0, 600.0
 """Focal lengths from the first on and up to the others may be degrees, or millimetres."""
@@ -60,8 +60,8 @@ def find_other_unit(
     """
     # Every carve asks `may_be_other_units`; the masks are compared only then, and by OpenCV.
     from visdom_plugin.hull.checks.causes.fault_hypotheses import find_causes
-    from visdom_plugin.hull.checks.distance_fields import OBJECT_PX
-    from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
+    from visdom_plugin.hull.outlines.distance_fields import OBJECT_PX
+    from visdom_plugin.hull.outlines.silhouette_consistency import measure_coherence
 
     focal, size = _numbers(cameras)
     readings = list(_readings(focal, size))
@@ -113,7 +113,7 @@ def measure_focal_range(outlines: Outlines, score: float) -> tuple[float, float]
     Returns:
         the smallest factor, at least 0.5, and the largest, at most 2; 1 for none.
     """
-    from visdom_plugin.hull.checks.silhouette_consistency import measure_coherence
+    from visdom_plugin.hull.outlines.silhouette_consistency import measure_coherence
 
     limit, rays = max(_QUIET_PX, 2 * score), max(_RANGE_RAYS // len(outlines), 16)
     reached = []

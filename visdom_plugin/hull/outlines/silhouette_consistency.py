@@ -14,7 +14,7 @@ import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
-from visdom_plugin.hull.checks.distance_fields import UNKNOWN_BELOW, Outlines, is_known
+from visdom_plugin.hull.outlines.distance_fields import UNKNOWN_BELOW, Outlines, is_known
 
 CAP_PX = 16.0
 """Residuals are cut off here: beyond it, wrong is wrong."""

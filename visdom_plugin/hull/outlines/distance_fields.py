@@ -10,7 +10,6 @@ import numpy as np
 
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import Silhouettes
-from visdom_plugin.hull.checks.mask_checks import object_length
 
 OBJECT_PX = 128
 """Pixels along the longest side of the typical mask that the fields are made for."""
@@ -73,7 +72,7 @@ def draw_outlines(cameras: Cameras, silhouettes: Silhouettes, *, object_px: int 
     """
     sides = silhouettes.sizes.max(1)
     known = silhouettes.demanding()
-    lengths = np.array([object_length(known.mask(view)) for view in range(len(known))]) / sides
+    lengths = np.array([_length(known.mask(view)) for view in range(len(known))]) / sides
     most = MOST_PX * object_px / OBJECT_PX
     longest = min(object_px / float(np.median(lengths[lengths > 0])), most) if lengths.any() else object_px
     fields, ratios = [], []
@@ -101,6 +100,11 @@ def is_known(field: np.ndarray) -> np.ndarray:
 def turn_over(field: np.ndarray) -> np.ndarray:
     """The field of the inverted mask; what is unknown stays so."""
     return np.where(is_known(field), -field, field)
+
+
+def _length(mask: np.ndarray) -> int:
+    """Longest side, in pixels, of the box around a mask's (H, W) foreground; 0 for an empty mask."""
+    return max(cv2.boundingRect(mask.astype(np.uint8))[2:])
 
 
 def _shrink(mask: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""Outlines of masks as distance fields, and how well they fit together."""
