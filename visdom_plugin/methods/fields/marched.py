@@ -181,8 +181,10 @@ class MarchedField(RadianceField[Config]):
         self, rays: LocalRays, samples: PackedSamples, background: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         density, features = self._features(points_of(rays, samples))
-        # Directions once per ray, then spread to its samples.
-        colours = self._look(features, self._encode_views(rays.directions)[samples.ray])
+        # Directions once per ray, then spread to its samples. Not by [samples.ray], whose gradients are summed in
+        # whatever order the threads come.
+        views = self._encode_views(rays.directions).index_select(0, samples.ray)
+        colours = self._look(features, views)
         rgb, alpha, depth, _ = composite_packed(
             density, colours, samples.starts, samples.ends, samples.ray_offsets, background
         )
