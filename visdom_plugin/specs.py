@@ -38,7 +38,7 @@ def check_requirements(config: object) -> None:
     """Asks a config that has such a method whether all is there that training takes from outside.
 
     Raises:
-        PluginError: something is not.
+        PluginError, ConfigError: something is not, or is named wrongly.
     """
     check = getattr(config, "check_requirements", None)
     if check is not None:

@@ -48,6 +48,8 @@ class _Need(NamedTuple):
 NEEDS_OF_HULL = (
     _Need("--sphere-centre", "--kind", ("unit-sphere",)),
     _Need("--sphere-radius", "--kind", ("unit-sphere",)),
+    _Need("--inside-radius", "--inside", ()),
+    _Need("--photo-weight", "--inside", ()),
 )
 NEEDS_OF_PREPARE = (_Need("--paper", "--print-board", ()),)
 NEEDS_OF_TABLE = (_Need("--slurm", "--executor", ("slurm",)),)

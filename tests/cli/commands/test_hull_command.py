@@ -86,6 +86,9 @@ def test_radius_and_photographs_change_the_shape_inside(scene, capsys):
     assert seen["volume"] != plain["volume"] and seen["photo_weight"] == 0.3
     assert main(["somewhere", "--photo-weight", "0.15"]) == 2
     assert "add --inside" in capsys.readouterr().err
+    for words in (["--inside-radius", "-1"], ["--photo-weight", "nan"]):
+        assert main(["somewhere", "--inside", *words]) == 2
+        assert f"where: {words[0]}" in capsys.readouterr().err
 
 
 def test_the_shape_inside_of_what_one_view_sees_is_refused(scene, capsys):

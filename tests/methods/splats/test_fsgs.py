@@ -21,6 +21,7 @@ from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.splats.fsgs.depth import DepthProvider, of_disparity, of_map, pearson
 from visdom_plugin.methods.splats.fsgs.method import FsgsLite
 from visdom_plugin.seeding import generator
+from visdom_plugin.specs import check_requirements
 from visdom_plugin.splat.densify import Proximity, unpooled
 from visdom_plugin.training.batches import DataManager
 
@@ -297,6 +298,9 @@ def test_a_network_that_is_not_there_is_named(scene, target):
     with pytest.raises(ConfigError, match="cannot be loaded") as refused:
         DepthProvider(scene.train, target, CPU)
     assert target in refused.value.where
+    with pytest.raises(ConfigError, match="cannot be loaded"):
+        check_requirements(replace(SMALL, depth_network=target))
+    check_requirements(SMALL)
 
 
 @pytest.mark.parametrize("with_network", [False, True])

@@ -104,19 +104,17 @@ def _main(argv: Sequence[str]) -> None:
 
 def _inside_config(options: Options) -> InsideConfig | None:
     """What is asked of the shape inside; None where it is not."""
-    radius, weight = options.inside_radius, options.photo_weight
-    if options.inside:
-        default = InsideConfig()
+    if not options.inside:
+        return None
+    radius, weight, default = options.inside_radius, options.photo_weight, InsideConfig()
+    try:
         return InsideConfig(
             radius=default.radius if radius is None else radius,
             photo_weight=default.photo_weight if weight is None else weight,
         )
-    if radius is not None or weight is not None:
-        raise ConfigError(
-            "--inside-radius and --photo-weight are about the shape inside the hull, which is not asked for",
-            todo="add --inside",
-        )
-    return None
+    except ConfigError as error:
+        option = "--photo-weight" if error.what.startswith("photo_weight") else "--inside-radius"
+        raise ConfigError(error.what, where=option, todo=error.todo) from error
 
 
 @dataclass(frozen=True)

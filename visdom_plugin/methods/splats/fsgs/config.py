@@ -83,3 +83,10 @@ class FsgsConfig(HullStartConfig):
                 )
             },
         )
+
+    def check_requirements(self) -> None:
+        """Loads the network, so that a name that leads nowhere is said before the hull is carved."""
+        if self.depth_network is not None:
+            from visdom_plugin.methods.splats.fsgs.depth import load_network
+
+            load_network(self.depth_network)
