@@ -59,7 +59,7 @@ SPEC = MethodSpec(
     hook="gaussian",
     description="3DGS-GO, the coarse stage of GaussianObject",
     # What the hull knows replaces what statistics guess: Gaussians outside it are removed, and the base method's
-    # removal of stray ones, which eats thin parts, is off. FINDINGS.md has the numbers.
+    # removal of stray ones, which eats thin parts, is off. docs/findings/gaussians.md has the numbers.
     variants={
         "vd": {"floater_every": 0},
         "vd:released": RELEASED,

@@ -31,6 +31,6 @@ SPEC = MethodSpec(
     hook="sampler",
     description="Instant-NGP",
     # The vanilla variant sees photographs on white. Those that use masks see them on random colours, too: a
-    # photograph with alpha is what Instant-NGP is made for. FINDINGS.md has what it brings.
+    # photograph with alpha is what Instant-NGP is made for. docs/findings/fields.md has what it brings.
     variants={"mask": {"background": "random"}, "vd": {"background": "random"}},
 )

@@ -1,4 +1,4 @@
-"""VisDom field: the best radiance field we know of for few photographs. FINDINGS.md has what its switch gives.
+"""VisDom field: the best radiance field we know of for few photographs. docs/findings/few_views.md has the gain.
 
 It is `ingp+vd` with a soft prior that the hull is empty beside the smoothest full shape inside it.
 """

@@ -1,7 +1,7 @@
 """VisDom GS: the best we know of for Gaussians from 4 to 12 photographs.
 
-It is `3dgs-go+vd` with five switches on; L_i on every second step pays for the virtual views. FINDINGS.md has what
-was tried on the way.
+It is `3dgs-go+vd` with five switches on; L_i on every second step pays for the virtual views.
+docs/findings/few_views.md has what was tried on the way.
 """
 
 from __future__ import annotations

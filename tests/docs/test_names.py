@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(
     path.relative_to(ROOT).as_posix()
-    for folder in (".", "docs", "docs/guide", "docs/guide/poses", "examples", "benchmarks")
+    for folder in (".", "docs", "docs/guide", "docs/guide/poses", "docs/findings", "examples", "benchmarks")
     for path in (ROOT / folder).glob("*.md")
 )
 PACKAGES = "visdom_plugin|method_configs|datamodules"

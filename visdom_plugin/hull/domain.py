@@ -155,4 +155,4 @@ class VisibleDomain(HullSettings):
 
 TRAINING_DOMAIN = VisibleDomain(dilate_px=1)
 """How the hull of the hooks is carved in all our methods: one pixel of dilation keeps the unanimity of few views
-from eating thin parts. FINDINGS.md has the numbers."""
+from eating thin parts. docs/findings/gaussians.md has the numbers."""
