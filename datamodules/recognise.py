@@ -88,7 +88,7 @@ def load(
     Args:
         path: the scene's folder; None is the built-in scene.
         views: number of training views; None takes the smallest index file, or 4.
-        downscale: >= 1, how much smaller than the photographs to work.
+        downscale: how much smaller than the photographs to work, at least 1.
         seed: of the built-in scene's noise; real data does not depend on it.
         test: False leaves the test views out, for callers that do not evaluate.
         data_format: the layout, one of `FORMATS`; None recognises it.

@@ -1,0 +1,29 @@
+"""What mkdocs calls as it builds the site: adds the pages that are made, turns links that lead out of docs/."""
+
+from __future__ import annotations
+
+import commands
+import messages
+import root_pages
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Adds the pages."""
+    made = {place: root_pages.read_page(source) for source, place in root_pages.PAGES.items()}
+    made |= {
+        "examples.md": root_pages.show_examples(),
+        "commands.md": commands.make_page(),
+        "messages.md": messages.make_page(),
+    }
+    for place, text in made.items():
+        files.append(File.generated(config, place, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Turns the links of a page of docs/."""
+    place = page.file.src_uri
+    return markdown if page.file.generated_by else root_pages.relink(markdown, f"docs/{place}", place)

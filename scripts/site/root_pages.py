@@ -1,0 +1,56 @@
+"""Pages of the site from the top of the tree, README, FINDINGS, CHANGELOG and CONTRIBUTING, and from the examples.
+
+Links between those files and docs/ work in the tree, and are turned into the site's here; of a link to any other
+file of the tree the words stay.
+"""
+
+from __future__ import annotations
+
+import ast
+import posixpath
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PAGES = {
+    "README.md": "index.md",
+    "FINDINGS.md": "findings/index.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+}
+"""Files at the top of the tree by their place on the site."""
+_CODE = r"^```.*?^```$|`[^`\n]*`"
+_LINK = re.compile(rf"{_CODE}|(!?)\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)", re.M | re.S)
+
+
+def read_page(source: str) -> str:
+    """A file at the top of the tree, for its place on the site."""
+    return relink((ROOT / source).read_text(encoding="utf-8"), source, PAGES[source])
+
+
+def relink(text: str, source: str, place: str) -> str:
+    """The text of the file `source` of the tree for the page `place` of the site."""
+
+    def link(found: re.Match[str]) -> str:
+        mark, words, path, anchor = found.groups()
+        if path is None:
+            return found[0]
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(source), path))
+        target = PAGES.get(target, target.removeprefix("docs/") if target.startswith("docs/") else None)
+        if target is None:
+            return words
+        return f"{mark}[{words}]({posixpath.relpath(target, posixpath.dirname(place) or '.')}{anchor or ''})"
+
+    return _LINK.sub(link, text)
+
+
+def show_examples() -> str:
+    """The scripts of examples/ with what their docstrings say."""
+    parts = ["# Examples\n\nScripts of `examples/`, from simple to less so. Each runs as it stands.\n"]
+    for path in sorted((ROOT / "examples").rglob("*.py")):
+        source = path.read_text(encoding="utf-8")
+        name, said = path.relative_to(ROOT).as_posix(), ast.get_docstring(ast.parse(source))
+        title, _, rest = (said or name).partition("\n")
+        code = source.split('"""', 2)[2] if said else source
+        parts.append(f"## {title.rstrip('.')}\n\n`{name}`\n\n{rest}\n\n```py\n{code.strip()}\n```\n")
+    return "\n".join(parts)

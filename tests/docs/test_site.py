@@ -1,0 +1,100 @@
+"""The pages of the site that are made from the tree. `.ci/run` builds the site, which checks its links, too."""
+
+import ast
+import importlib
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+import visdom_plugin
+
+ROOT = Path(__file__).parents[2]
+API = (ROOT / "docs/api.md").read_text(encoding="utf-8")
+SECTIONS = re.findall(r"^::: ([\w.]+)\n    options: \{.*members: \[([\w, ]+)\]\}$", API, re.M)
+
+
+@pytest.fixture
+def part(monkeypatch):
+    """Imports one of the site's parts."""
+    monkeypatch.syspath_prepend(ROOT / "scripts/site")
+    yield importlib.import_module
+    for path in (ROOT / "scripts/site").glob("*.py"):
+        sys.modules.pop(path.stem, None)
+
+
+def definitions(module: str) -> dict[str, ast.AST]:
+    tree = ast.parse((ROOT / module.replace(".", "/")).with_suffix(".py").read_text(encoding="utf-8"))
+    return {n.name: n for n in tree.body if isinstance(n, ast.ClassDef | ast.FunctionDef)}
+
+
+def test_every_name_of_the_api_page_is_there_and_documented():
+    assert len(SECTIONS) == API.count("\n::: ") > 20
+    for module, members in SECTIONS:
+        found = definitions(module)
+        for name in members.split(", "):
+            assert ast.get_docstring(found[name]), f"{module}.{name}"
+
+
+def test_the_api_page_has_every_public_name_and_what_the_examples_import():
+    described = {name for _, members in SECTIONS for name in members.split(", ")}
+    assert set(visdom_plugin.__all__) - {"__version__"} <= described
+    described |= {module.rpartition(".")[2] for module, _ in SECTIONS}
+    for path in (ROOT / "examples/my_method").rglob("*.py"):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("visdom_plugin"):
+                assert {name.name for name in node.names} <= described, path
+
+
+def test_every_page_of_docs_is_in_the_navigation(part):
+    made = {*part("root_pages").PAGES.values(), "commands.md", "messages.md", "examples.md"}
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    named = re.findall(r"[\w/]+\.md", text)
+    pages = {p.relative_to(ROOT / "docs").as_posix() for p in (ROOT / "docs").rglob("*.md")}
+    assert sorted(named) == sorted(pages | made)
+
+
+def test_the_page_of_commands_has_every_command_and_option(part):
+    commands = part("commands")
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    declared = re.findall(r'^(visdom-\w+) = "[\w.]+:main"$', project, re.M)
+    assert set(commands.COMMANDS) == set(declared)
+    said = commands.help_of("visdom-check", [])
+    rows = dict(commands.options(said))
+    assert {"--views INT", "--data {None}|PATH", "--json, --no-json"} <= set(rows)
+    assert set(re.findall(r"^│ +(--[\w.-]+)", said, re.M)) == {
+        o.split()[0].strip(",") for o in rows if o[:2] == "--"
+    }
+    assert rows["--seed INT"] == "Random seed. (default: 0)"
+    page = commands.render(said, {"--seed INT"})
+    assert "`--views INT`\n:   Number of training views" in page and "--seed" not in page
+
+
+def test_the_page_of_messages_has_the_words_of_the_source(part):
+    messages = part("messages")
+    found = list(messages.find_messages())
+    assert len(found) > 350
+    assert "the mask is empty: no pixel of it is foreground" in {m.what for m in found}
+    page = messages.make_page()
+    assert page.count("\n| ") > 350 and "there is no COLMAP model in this folder" in page
+    source = ast.parse('ConfigError(f"{a} is {b}; at least 1" + (f"; {c}" if d else ""))', mode="eval")
+    assert messages.spell(source.body.args[0]) == "... is ...; at least 1; ..."
+
+
+def test_links_out_of_docs_become_the_sites_own(part):
+    pages = part("root_pages")
+    text = "[a](docs/gpu.md#x) ![b](docs/pictures/b.png) [c](CHANGELOG.md) [d](examples/my_method) [e](https://e.org)"
+    there = "[a](gpu.md#x) ![b](pictures/b.png) [c](changelog.md) d [e](https://e.org)"
+    assert pages.relink(text, "README.md", "index.md") == there
+    up = pages.relink("[f](../../FINDINGS.md)", "docs/guide/x.md", "guide/x.md")
+    assert up == "[f](../findings/index.md)"
+    code = "`a[b](c)`\n```\na[b](c)\n```\n"
+    assert pages.relink(code, "README.md", "index.md") == code
+
+
+def test_the_extra_is_bounded():
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    (needed,) = re.findall(r"^docs = \[(.*)\]$", project, re.M)
+    assert all(re.search(r">=[\d.]+,<\d", one) for one in yaml.safe_load(f"[{needed}]"))
