@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from .hull.hull import Hull
     from .render import Render
     from .scene import Scene, Views
+    from .workflow.runs import Run, open_run, save_image, train
+    from .workflow.scenes import carve, check, load
 
 __version__ = "0.1.0"
 
@@ -32,6 +34,13 @@ _HOME = {
     "Hull": "visdom_plugin.hull.hull",
     "VisDomSampler": "visdom_plugin.hooks.sampler",
     "VisDomGaussianRegularizer": "visdom_plugin.hooks.regularizer",
+    "load": "visdom_plugin.workflow.scenes",
+    "check": "visdom_plugin.workflow.scenes",
+    "carve": "visdom_plugin.workflow.scenes",
+    "train": "visdom_plugin.workflow.runs",
+    "open_run": "visdom_plugin.workflow.runs",
+    "save_image": "visdom_plugin.workflow.runs",
+    "Run": "visdom_plugin.workflow.runs",
 }
 
 __all__ = [
@@ -40,6 +49,7 @@ __all__ = [
     "Hull",
     "Rays",
     "Render",
+    "Run",
     "Scene",
     "Views",
     "VisDomError",
@@ -47,6 +57,12 @@ __all__ = [
     "VisDomSampler",
     "VisibleDomain",
     "__version__",
+    "carve",
+    "check",
+    "load",
+    "open_run",
+    "save_image",
+    "train",
 ]
 
 

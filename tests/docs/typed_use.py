@@ -10,17 +10,24 @@ from visdom_plugin import (
     Hull,
     Rays,
     Render,
+    Run,
     Scene,
     Views,
     VisDomError,
     VisDomGaussianRegularizer,
     VisDomSampler,
     VisibleDomain,
+    carve,
+    check,
+    load,
+    open_run,
+    save_image,
+    train,
 )
 from visdom_plugin.losses import mask_loss
 
 
-def carve(K: np.ndarray, motion: np.ndarray, masks: list[Tensor]) -> Hull:
+def carve_arrays(K: np.ndarray, motion: np.ndarray, masks: list[Tensor]) -> Hull:
     cameras = Cameras.from_matrices(K, motion, width=64, height=48, convention="opencv")
     assert_type(cameras, Cameras)
     try:
@@ -48,3 +55,14 @@ def regularise(hull: Hull, views: Views, render: Render) -> Tensor:
 
 def test_cameras(scene: Scene) -> Cameras:
     return scene.test.cameras
+
+
+def reconstruct(folder: str) -> dict[str, float]:
+    scene = load(folder, views=4)
+    assert_type(scene, Scene)
+    assert_type(carve(scene), Hull)
+    todo: list[str] = [finding.todo for finding in check(scene)]
+    run = train("3dgs-go+vd", scene, out="run", steps=len(todo))
+    assert_type(run, Run)
+    save_image("view.png", run.render(scene.test.cameras[0]))
+    return open_run("run").evaluate()

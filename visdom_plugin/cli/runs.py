@@ -67,7 +67,6 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None, *, test: bo
     """
     from visdom_plugin import registry
     from visdom_plugin.training.run import add_points
-    from visdom_plugin.training.runs.run_directory import hash_views
 
     noted = record["data"]
     path = data if data is not None else noted.get("path")
@@ -77,16 +76,33 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None, *, test: bo
         )
     scene = _open_noted(path, noted, run, test)
     scene = add_points(scene, registry.find(record["method"]), record["config"].get("hull"))
+    refuse_other_scene(scene, record, run, f"the scene at {path or '(built-in)'}", test=test)
+    return scene
+
+
+def refuse_other_scene(
+    scene: Scene, record: dict[str, Any], run: Path, named: str, *, test: bool = True
+) -> None:
+    """Sees to it that a scene is the one of a run.
+
+    Args:
+        named: the scene, for the error message.
+        test: False leaves the test views out.
+
+    Raises:
+        CheckpointError: it is not.
+    """
+    from visdom_plugin.training.runs.run_directory import hash_views
+
     parts = [("train_views", scene.train, "trained")] + [("test_views", scene.test, "measured")] * test
     for name, views, used in parts:
-        if hash_views(views) != noted["hashes"][name]:
+        if hash_views(views) != record["data"]["hashes"][name]:
             raise CheckpointError(
-                f"the scene at {path or '(built-in)'} is not the one this run was {used} on",
+                f"{named} is not the one this run was {used} on",
                 where=f"{run}: {name.replace('_', ' ')}",
                 cause="the images, masks or poses were changed, or another version of the software reads them",
                 todo="pass the right folder with --data DIR, or train again with another --out",
             )
-    return scene
 
 
 def _open_noted(path: Path | None, noted: dict[str, Any], run: Path, test: bool) -> Scene:
