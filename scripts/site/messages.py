@@ -31,6 +31,7 @@ SUBJECTS = {
     "visdom_plugin/viewer": "Exports and the viewer",
     "visdom_plugin/tables": "Tables",
     "visdom_plugin/cli": "Options of commands",
+    "visdom_plugin/workflow": "Functions from Python",
 }
 HEAD = """# All messages
 
