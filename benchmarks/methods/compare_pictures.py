@@ -1,7 +1,7 @@
 """One sheet of test views, a row per finished run and the truth on top.
 
     cd runs/quality/built-in/4
-    python ../../../../benchmarks/methods/compare_pictures.py --out sheet.png 3dgs-go/0 3dgs-go+mask/0 3dgs-go+vd/0
+    python ../../../../benchmarks/methods/compare_pictures.py --out s.webp 3dgs-go/0 3dgs-go+mask/0 3dgs-go+vd/0
 
 The runs must be of one scene; the truth is loaded as the first run's was.
 """
@@ -18,7 +18,7 @@ import numpy as np
 from datamodules import load
 from visdom_plugin.cli.entry import run
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.figures.contact_sheet import draw_sheet, picture_names, to_bytes, write_png
+from visdom_plugin.figures.contact_sheet import draw_sheet, picture_names, to_bytes
 from visdom_plugin.training.metrics import whiten
 from visdom_plugin.training.runs.run_directory import read_record
 
@@ -47,7 +47,8 @@ def main(argv: list[str]) -> None:
             pictures.append(image[..., ::-1])
         columns.append((names[i], pictures))
     rows = ["truth", *(record["method"] for record in records)]
-    write_png(args.out, draw_sheet(columns, rows))
+    sheet = np.ascontiguousarray(draw_sheet(columns, rows)[..., ::-1])
+    cv2.imwrite(str(args.out), sheet, [cv2.IMWRITE_WEBP_QUALITY, 85])
 
 
 if __name__ == "__main__":

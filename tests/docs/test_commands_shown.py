@@ -22,7 +22,11 @@ STAND_INS = ("method:my-method+vd", "method:$m", "method:NAME")
 def shown(page: Path) -> list[list[str]]:
     """The commands in a page's blocks, as words."""
     found = []
-    for block in re.findall(r"^```(?:bash)?\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S):
+    for language, block in re.findall(
+        r"^```(\w*)\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S
+    ):
+        if language not in ("", "bash"):
+            continue
         for line in block.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True) if "visdom-" in line else []
             while words and not re.match(r"visdom-(?!plugin)", words[0]):

@@ -1,0 +1,99 @@
+"""The README's picture: four photographs, and unseen views by methods without and with the visible domain.
+
+for m in zipnerf-lite zipnerf-lite+vd 3dgs-go visdom-gs; do visdom-train method:$m --views 4 --out runs/$m; done
+python scripts/site/figures/before_after.py runs/zipnerf-lite runs/zipnerf-lite+vd runs/3dgs-go runs/visdom-gs
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+
+from datamodules import load
+from visdom_plugin.figures.canvas import drawing
+from visdom_plugin.figures.contact_sheet import picture_names, to_bytes
+from visdom_plugin.training.metrics import whiten
+from visdom_plugin.training.runs.run_directory import read_record
+
+PICTURES = Path(__file__).parents[3] / "docs" / "pictures"
+VIEWS = (4, 11)
+"""Test views that are shown."""
+TITLES = {
+    "zipnerf-lite": "Zip-NeRF",
+    "zipnerf-lite+vd": "Zip-NeRF\n+ visible domain",
+    "3dgs-go": "Gaussian splatting",
+    "visdom-gs": "visdom-gs: splatting\n+ visible domain",
+}
+
+
+def main() -> None:
+    """Draws the runs that are named."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--out", type=Path, default=PICTURES / "before_after.webp")
+    args = parser.parse_args()
+    scene = load(None, views=4)
+    names = picture_names(scene.test.names)
+    columns = [("truth", [_white(scene.test, i) for i in VIEWS])]
+    for run in args.runs:
+        record = read_record(run)
+        psnr = record["metrics"]["test"]["psnr"]
+        pictures = [cv2.imread(str(run / "renders/test" / f"{names[i]}.png"))[..., ::-1] for i in VIEWS]
+        columns.append((f"{TITLES[record['method']]}\n{psnr:.1f} dB", pictures))
+    write_webp(draw([_white(scene.train, i) for i in range(4)], columns), args.out)
+
+
+def _white(views, index: int) -> np.ndarray:
+    return to_bytes(whiten(views.images[index], views.masks[index]))
+
+
+def draw(photographs: list[np.ndarray], columns: list[tuple[str, list[np.ndarray]]]) -> np.ndarray:
+    """(H, W, 3) uint8: the photographs in a column of small ones at the left, then a column for each method."""
+    rows, size = len(columns[0][1]), 2.3
+    top, left = 0.75, rows * size / 4
+    width, height = left + 0.35 + len(columns) * size, top + rows * size
+    with drawing():
+        figure = Figure((width, height), dpi=110, facecolor="white")
+
+        def place(picture: np.ndarray, x: float, y: float, side: float) -> None:
+            axes = figure.add_axes((x / width, 1 - (y + side) / height, side / width, side / height))
+            axes.imshow(picture, interpolation="lanczos")
+            axes.set_axis_off()
+
+        for i, photograph in enumerate(photographs):
+            place(photograph, 0, top + i * left, left)
+        figure.text(left / 2 / width, 1 - top / 2 / height, "4 photographs", ha="center", va="center")
+        for c, (title, pictures) in enumerate(columns):
+            x = left + 0.35 + c * size
+            figure.text(
+                (x + size / 2) / width, 1 - top / 2 / height, title, ha="center", va="center", size=12
+            )
+            for r, picture in enumerate(pictures):
+                place(picture, x, top + r * size, size)
+        return pixels_of(figure)
+
+
+def pixels_of(figure: Figure) -> np.ndarray:
+    """(H, W, 3) uint8."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def write_webp(picture: np.ndarray, path: Path, quality: int = 85) -> None:
+    """Writes (H, W, 3) RGB and says how large the file is."""
+    cv2.imwrite(str(path), np.ascontiguousarray(picture[..., ::-1]), [cv2.IMWRITE_WEBP_QUALITY, quality])
+    print(f"{path}: {picture.shape[1]} x {picture.shape[0]}, {path.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
