@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from datamodules.built_in import NAMES, PREFIX, named_built_in
 from datamodules.request import Request
 from visdom_plugin.errors import ConfigError, SceneError
 
@@ -86,7 +87,7 @@ def load(
     """Opens a scene.
 
     Args:
-        path: the scene's folder; None is the built-in scene.
+        path: the scene's folder, or "builtin:NAME", a name out of `built_in.NAMES`; None is the first of these.
         views: number of training views; None takes the smallest index file, or 4.
         downscale: how much smaller than the photographs to work, at least 1.
         seed: of the built-in scene's noise; real data does not depend on it.
@@ -103,7 +104,8 @@ def load(
     """
     request = Request(views=views, downscale=downscale, test=test, **reading)
     _check_format(data_format)
-    if path is None:
+    built_in = named_built_in(path)
+    if built_in is not None:
         if data_format is not None:
             raise ConfigError(
                 "the built-in scene has no files", where="--data-format", todo="name a scene with --data"
@@ -115,9 +117,10 @@ def load(
         config = SyntheticConfig(downscale=downscale, seed=seed)
         if views is not None:
             config = replace(config, train_views=views)
-        return make_scene(config if test else replace(config, test_views=0))
+        return make_scene(config if test else replace(config, test_views=0), built_in)
     from datamodules.open_scene import open_capture
 
+    assert path is not None
     with opening(path) as root:
         return open_capture(read_capture(root, data_format, request), request)
 
@@ -147,7 +150,10 @@ def opening(path: str | Path) -> Iterator[Path]:
         ) from error
 
 
-_SCENE_TODO = "pass --data with the folder of a scene, or leave it out for the built-in scene"
+_SCENE_TODO = (
+    "pass --data with the folder of a scene or a built-in scene, or leave it out for the first of them: "
+    + ", ".join(PREFIX + name for name in NAMES)
+)
 
 
 def find_folder(path: str | Path, todo: str = _SCENE_TODO) -> Path:

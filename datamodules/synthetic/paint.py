@@ -10,7 +10,7 @@ import numpy as np
 
 from datamodules.synthetic.shape import PARTS
 
-_LIGHT = np.array([0.48, -0.36, 0.80], np.float32)
+LIGHT = np.array([0.48, -0.36, 0.80], np.float32)
 _PALETTES = {
     "body": [(0.05, 0.20, 0.62), (0.98, 0.78, 0.10), (0.02, 0.55, 0.60), (0.93, 0.90, 0.82), (0.86, 0.16, 0.12)],
     "inside": [(0.95, 0.55, 0.12), (0.98, 0.72, 0.30), (0.90, 0.42, 0.10), (0.99, 0.82, 0.50), (0.85, 0.35, 0.15)],
@@ -56,7 +56,7 @@ def paint_object(points: np.ndarray, normals: np.ndarray, parts: np.ndarray) -> 
         10.1 * z + wave(4 * x)
     )
     shade = 1 + 0.10 * fine
-    light = normals[:, 0] * _LIGHT[0] + normals[:, 1] * _LIGHT[1] + normals[:, 2] * _LIGHT[2]
+    light = normals[:, 0] * LIGHT[0] + normals[:, 1] * LIGHT[1] + normals[:, 2] * LIGHT[2]
     shade = shade * (0.70 + 0.30 * light)
     # Light reaches the bottom of the can and the table's side of the foot only in part.
     sunk = np.where(
@@ -76,7 +76,7 @@ def paint_room(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
         (M, 3) float32 in [0, 1].
     """
     dx, dy, dz = directions.T
-    room = _room(dx, dy, dz)
+    room = room_colour(dx, dy, dz)
     down = np.minimum(dz, np.float32(-1e-4))
     t = np.float32(-origin[2]) / down
     x, y = np.float32(origin[0]) + t * dx, np.float32(origin[1]) + t * dy
@@ -85,7 +85,8 @@ def paint_room(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return room + edge[:, None].astype(np.float32) * (_table(x, y) - room)
 
 
-def _room(dx: np.ndarray, dy: np.ndarray, dz: np.ndarray) -> np.ndarray:
+def room_colour(dx: np.ndarray, dy: np.ndarray, dz: np.ndarray) -> np.ndarray:
+    """(M, 3) float32 of the blurred room in unit directions."""
     height = np.clip(0.5 + 0.9 * dz, 0, 1)[:, None]
     low, high = np.array([0.34, 0.28, 0.25], np.float32), np.array([0.62, 0.72, 0.78], np.float32)
     glow = (

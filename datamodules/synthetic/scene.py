@@ -18,12 +18,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from datamodules.built_in import DEFAULT
 from datamodules.hashing import hash_parts
+from datamodules.synthetic.catalogue import BuiltIn, find_object
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.noise import disturb_masks, disturb_poses
-from datamodules.synthetic.paint import paint_object, paint_room
+from datamodules.synthetic.paint import paint_room
 from datamodules.synthetic.render import rasterise
-from datamodules.synthetic.shape import Shape, watering_can
 from visdom_plugin.geometry.camera_paths import look_at_camera
 from visdom_plugin.geometry.cameras import Cameras, project
 from visdom_plugin.scene import Scene, Views
@@ -31,7 +32,6 @@ from visdom_plugin.scene import Scene, Views
 _CENTRE = (1.7, -0.9, 0.6)
 _SCALE = 1.3
 _YAW = 0.6
-_MIDDLE = (0.13, 0.0, 0.66)
 _SAMPLES = 3
 # Training cameras: azimuth and elevation (degrees), distance (in shapes' units), field of view (degrees), aim
 # off the object's middle (right, up; in half images) and principal point off the image's centre (in images).
@@ -56,8 +56,11 @@ _TRAIN = (
 )
 
 
-def make_scene(config: SyntheticConfig | None = None) -> Scene:
-    """Draws the built-in scene; the same pictures, bit for bit, for the same config.
+def make_scene(config: SyntheticConfig | None = None, name: str = DEFAULT) -> Scene:
+    """Draws a built-in scene; the same pictures, bit for bit, for the same config.
+
+    Args:
+        name: one of `datamodules.built_in.NAMES`.
 
     Returns:
         Scene with `mesh` set: the exact surface in the world frame. Masks are the exact silhouettes at pixel
@@ -68,16 +71,17 @@ def make_scene(config: SyntheticConfig | None = None) -> Scene:
     """
     config = config or SyntheticConfig()
     config.check()
-    shape = watering_can()
+    subject = find_object(name)
+    vertices = torch.from_numpy(to_world(subject.shape.vertices, subject.middle))
     cameras = Cameras.stack([_camera(config, row) for row in _rows(config)])
     if config.truncation:
-        cameras = _truncate(config, cameras, shape)
-    pictures = _draw(config, cameras, shape)
+        cameras = _truncate(config, cameras, vertices)
+    pictures = _draw(config, cameras, subject)
     n = config.train_views
 
     def views(part: slice, prefix: str, poses: Cameras, masks: Sequence[Tensor]) -> Views:
-        names = tuple(f"{prefix}_{i:03d}" for i in range(len(poses)))
-        return Views(poses, tuple(p[0] for p in pictures[part]), tuple(masks), names)
+        numbered = tuple(f"{prefix}_{i:03d}" for i in range(len(poses)))
+        return Views(poses, tuple(p[0] for p in pictures[part]), tuple(masks), numbered)
 
     masks = disturb_masks([p[1] for p in pictures[:n]], config)
     train = views(slice(0, n), "train", disturb_poses(cameras[:n], config), masks)
@@ -92,14 +96,16 @@ def make_scene(config: SyntheticConfig | None = None) -> Scene:
         "test": list(test.names),
         "hashes": hash_parts(train),
     }
-    vertices = torch.from_numpy(to_world(shape.vertices))
-    return Scene("built-in", train, test, "unknown", source, mesh=(vertices, torch.from_numpy(shape.faces)))
+    # The first of them was there before the others, and keeps the name that its runs have.
+    scene_name = "built-in" if name == DEFAULT else name
+    mesh = (vertices, torch.from_numpy(subject.shape.faces))
+    return Scene(scene_name, train, test, "unknown", source, mesh=mesh)
 
 
-def to_world(points: ArrayLike) -> np.ndarray:
+def to_world(points: ArrayLike, middle: tuple[float, float, float]) -> np.ndarray:
     """Points (..., 3) of the shape's frame in the world frame: turned, scaled and moved off the origin."""
     c, s = math.cos(_YAW), math.sin(_YAW)
-    local = np.asarray(points) - np.array(_MIDDLE)
+    local = np.asarray(points) - np.array(middle)
     x, y, z = local[..., 0], local[..., 1], local[..., 2]
     turned = np.stack([c * x - s * y, s * x + c * y, z], -1)
     return _SCALE * turned + np.array(_CENTRE)
@@ -143,8 +149,8 @@ def _camera(config: SyntheticConfig, row: tuple[float, ...]) -> Cameras:
     )
 
 
-def _truncate(config: SyntheticConfig, cameras: Cameras, shape: Shape) -> Cameras:
-    uv, _ = project(cameras, torch.from_numpy(to_world(shape.vertices)))
+def _truncate(config: SyntheticConfig, cameras: Cameras, vertices: Tensor) -> Cameras:
+    uv, _ = project(cameras, vertices)
     left, right = uv[..., 0].amin(-1), uv[..., 0].amax(-1)
     # Even views lose their right-hand side, and so on in turn; the object slides out over the frame's edge.
     shift = cameras.width + config.truncation * (right - left) - right
@@ -156,16 +162,17 @@ def _truncate(config: SyntheticConfig, cameras: Cameras, shape: Shape) -> Camera
     return Cameras(K, cameras.world_from_camera, cameras.width, cameras.height)
 
 
-def _draw(config: SyntheticConfig, cameras: Cameras, shape: Shape) -> list[tuple[Tensor, Tensor]]:
+def _draw(config: SyntheticConfig, cameras: Cameras, subject: BuiltIn) -> list[tuple[Tensor, Tensor]]:
     """(image, mask) of every camera."""
     with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(lambda i: _photograph(config, cameras[i], shape), range(len(cameras))))
+        return list(pool.map(lambda i: _photograph(config, cameras[i], subject), range(len(cameras))))
 
 
-def _photograph(config: SyntheticConfig, camera: Cameras, shape: Shape) -> tuple[Tensor, Tensor]:
+def _photograph(config: SyntheticConfig, camera: Cameras, subject: BuiltIn) -> tuple[Tensor, Tensor]:
+    shape = subject.shape
     s, width, height = _SAMPLES, int(camera.width), int(camera.height)
     K, motion = camera.intrinsics.numpy(), camera.world_from_camera.numpy()
-    away = to_world(shape.vertices) - motion[:3, 3]
+    away = to_world(shape.vertices, subject.middle) - motion[:3, 3]
     local = [
         away[:, 0] * motion[0, k] + away[:, 1] * motion[1, k] + away[:, 2] * motion[2, k] for k in range(3)
     ]
@@ -179,7 +186,11 @@ def _photograph(config: SyntheticConfig, camera: Cameras, shape: Shape) -> tuple
             corners[:, 0] * weights[:, :1] + corners[:, 1] * weights[:, 1:2] + corners[:, 2] * weights[:, 2:]
         )
 
-    colours = paint_object(blend(shape.vertices), blend(shape.normals), shape.parts[seen.face])
+    origin, directions = _rays_in_shape(camera, subject.middle)
+    points = blend(shape.vertices)
+    towards = points - origin.astype(np.float32)
+    towards /= np.sqrt(towards[:, :1] ** 2 + towards[:, 1:2] ** 2 + towards[:, 2:] ** 2)
+    colours = subject.paint(points, blend(shape.normals), shape.parts[seen.face], towards)
     samples = np.zeros((height * s * width * s, 4), np.float32)
     samples[seen.sample, :3], samples[seen.sample, 3] = colours, 1
     samples = samples.reshape(height, s, width, s, 4)
@@ -187,7 +198,7 @@ def _photograph(config: SyntheticConfig, camera: Cameras, shape: Shape) -> tuple
     parts = (samples[:, i, :, j] for i in range(s) for j in range(s))
     mean = functools.reduce(np.add, parts) / np.float32(s * s)
     if config.background == "room":
-        behind = paint_room(*_rays_in_shape(camera)).reshape(height, width, 3)
+        behind = paint_room(origin, directions).reshape(height, width, 3)
     else:
         behind = np.full((height, width, 3), float(config.background == "white"), np.float32)
     image = mean[..., :3] + (1 - mean[..., 3:]) * behind
@@ -195,7 +206,7 @@ def _photograph(config: SyntheticConfig, camera: Cameras, shape: Shape) -> tuple
     return torch.from_numpy(image), torch.from_numpy(mask.copy())
 
 
-def _rays_in_shape(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
+def _rays_in_shape(camera: Cameras, middle: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and directions (H W, 3) float32 of the pixel centres in the shape's frame."""
 
     K, motion = camera.intrinsics.numpy(), camera.world_from_camera.numpy()
@@ -206,6 +217,4 @@ def _rays_in_shape(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
     d = np.stack([c * local[0] + s * local[1], c * local[1] - s * local[0], local[2]], -1)
     d /= np.sqrt(d[:, :1] ** 2 + d[:, 1:2] ** 2 + d[:, 2:] ** 2)
     o = (motion[:3, 3] - np.array(_CENTRE)) / _SCALE
-    return np.array([c * o[0] + s * o[1], c * o[1] - s * o[0], o[2]]) + np.array(_MIDDLE), d.astype(
-        np.float32
-    )
+    return np.array([c * o[0] + s * o[1], c * o[1] - s * o[0], o[2]]) + np.array(middle), d.astype(np.float32)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, cast, get_a
 
 import tyro
 
+from datamodules.built_in import on_disk
 from datamodules.recognise import FORMATS, find_folder
 from visdom_plugin import registry
 from visdom_plugin.cli.early import WORD, Early, read_early
@@ -63,7 +64,8 @@ class SceneOptions(Reading):
     """Options of every command that reads training views."""
 
     data: Path | None = None
-    """Folder of the scene; by default the built-in, procedural scene."""
+    """Folder of the scene, or a built-in, procedural one: builtin:watering-can (the default), builtin:duck,
+    builtin:figure, builtin:chair."""
     views: int = 4
     """Number of training views; a scene that has no more trains on all of them."""
     downscale: float = 1.0
@@ -89,7 +91,8 @@ class FolderOptions(SceneOptions):
     """Options of the commands that take the scene as a word of its own, too."""
 
     folder: tyro.conf.Positional[Path | None] = None
-    """Folder of the scene; by default the built-in, procedural scene."""
+    """Folder of the scene, or a built-in, procedural one: builtin:watering-can (the default), builtin:duck,
+    builtin:figure, builtin:chair."""
 
     @property
     def scene_folder(self) -> Path | None:
@@ -106,10 +109,11 @@ class FolderOptions(SceneOptions):
         """The scene that was named; asked before what takes seconds to import.
 
         Raises:
-            ConfigError: two are named.
+            ConfigError: two are named, or a built-in scene that is not there.
             SceneError: there is no such folder.
         """
-        return None if self.scene_folder is None else find_folder(self.scene_folder)
+        named = self.scene_folder
+        return named if named is None or on_disk(named) is None else find_folder(named)
 
 
 @dataclass(frozen=True)
@@ -259,8 +263,9 @@ def resolve_lists(reading: dict[str, Any]) -> dict[str, Any]:
 
 def describe_reading(common: Common) -> dict[str, Any]:
     """How the scene was asked for, as run.json notes it, so that it can be loaded again."""
-    path = None if common.data is None else str(common.data.expanduser().resolve())
-    return {"path": path, **read_options(common)}
+    folder = on_disk(common.data)
+    path = common.data if folder is None else folder.expanduser().resolve()
+    return {"path": None if path is None else str(path), **read_options(common)}
 
 
 def dump(request: Request) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from datamodules.built_in import on_disk
 from visdom_plugin.cli import options
 from visdom_plugin.cli.scenes import make_data_manager, open_scene
 from visdom_plugin.errors import CheckpointError, ConfigError
@@ -70,7 +71,8 @@ def load_again(record: dict[str, Any], run: Path, data: Path | None, *, test: bo
 
     noted = record["data"]
     path = data if data is not None else noted.get("path")
-    if path is not None and not Path(path).is_dir():
+    folder = on_disk(path)
+    if folder is not None and not folder.is_dir():
         raise CheckpointError(
             f"the run's scene is not at {path} any more", where=run, todo="say where it is with --data DIR"
         )
@@ -112,7 +114,7 @@ def _open_noted(path: Path | None, noted: dict[str, Any], run: Path, test: bool)
     asked = {name: noted[name] for name in options.READING if name in noted}
     # What was held out is read as it was then, as a training view.
     held = [noted["held_out"]] if "held_out" in noted else []
-    if path is not None:
+    if on_disk(path) is not None:
         asked |= _list_views([*noted["train"], *held], [] if held else noted["test"])
         asked["frame"] = noted.get("frame_number")
     try:

@@ -17,7 +17,7 @@ from visdom_plugin.errors import ConfigError, unknown_name
 from visdom_plugin.training.runs.config_io import from_plain, read_mapping
 
 BUILT_IN = "built-in"
-"""Root and scene name of the scene that needs no folder."""
+"""Root of the scenes that need no folder, and the name of the first of them."""
 FACTS = (
     "budget",
     "downscale",
@@ -61,7 +61,7 @@ class Column:
     root: str = BUILT_IN
     """"built-in", or the name of a data root, whose folder `--root NAME=DIR` or VISDOM_ROOT_<NAME> gives."""
     scenes: tuple[str, ...] = (BUILT_IN,)
-    """Folders below the root; "." is the root itself."""
+    """Folders below the root; "." is the root itself. Of the built-in root, names as after `builtin:`."""
     views: tuple[int, ...] = (4,)
     """Numbers of training views; each makes jobs of its own."""
     downscale: float = 1.0
@@ -302,12 +302,6 @@ def check_spec(spec: TableSpec, where: str) -> None:
                 f"column {column.label!r} has views {list(column.views)} and downscale {column.downscale:g}; "
                 "both must be 1 or more",
                 where=where,
-            )
-        if column.root == BUILT_IN and column.scenes != (BUILT_IN,):
-            raise ConfigError(
-                f"column {column.label!r} names scenes of the built-in root: {', '.join(column.scenes)}",
-                where=where,
-                todo="give `root:` a name and pass its folder with --root NAME=DIR, or leave `scenes:` out",
             )
 
 

@@ -12,6 +12,8 @@ import torch
 import trimesh
 
 from datamodules import load
+from datamodules.built_in import DEFAULT
+from datamodules.synthetic.catalogue import find_object
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.noise import disturb_poses
 from datamodules.synthetic.render import rasterise
@@ -105,7 +107,7 @@ def test_the_nearest_surface_is_drawn(scene, mesh):
 
 
 def test_what_is_drawn_lies_inside_the_image_whatever_the_crop():
-    vertices, faces = to_world(watering_can().vertices), watering_can().faces
+    vertices, faces = to_world(watering_can().vertices, find_object(DEFAULT).middle), watering_can().faces
     scene = make_scene(SyntheticConfig(size=(24, 20), train_views=2, test_views=0, truncation=0.9))
     uv, depth = project(scene.train.cameras[1], torch.from_numpy(vertices))
     assert ((uv < 0) | (uv > 24)).any()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from datamodules.built_in import on_disk
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
 from visdom_plugin.errors import ConfigError, SceneError, list_some
@@ -58,6 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _main(argv: Sequence[str]) -> int:
     options = tyro.cli(Options, args=list(argv), prog="visdom-check")
     folder = options.find_scene_folder()
+    place = on_disk(folder)
     if options.k != "auto" and options.k < 1:
         raise ConfigError(f"k is {options.k}", where="--k", todo="use a whole number from 1, or auto")
     if options.out is not None and options.out.exists() and not options.out.is_dir():
@@ -69,9 +71,9 @@ def _main(argv: Sequence[str]) -> int:
         scene = open_scene(folder, **read_options(options), fill=False, test=False)
         views, masks = carving_views(scene.train)
     except SceneError as error:
-        if folder is None or not _is_about_a_mask(error, folder):
+        if place is None or not _is_about_a_mask(error, place):
             raise
-        _show({"scene": folder.name, "views": [], "findings": [_unreadable(error)], "notes": []}, options)
+        _show({"scene": place.name, "views": [], "findings": [_unreadable(error)], "notes": []}, options)
         return FOUND
     loaded = time.perf_counter()
     k = None if options.k == "auto" else options.k
@@ -82,8 +84,8 @@ def _main(argv: Sequence[str]) -> int:
         made = [f._replace(todo=todo) if f.kind == "few" else f for f in found.findings]
         found = replace(found, findings=made)
     report = {"scene": scene.name, **describe_check(found, views.names, inverted=options.invert_masks)}
-    if folder is not None and found.usable:
-        report["choice"] = _suggest(scene, found, views.names, folder, read_options(options))
+    if place is not None and found.usable:
+        report["choice"] = _suggest(scene, found, views.names, place, read_options(options))
     report["seconds"] = {
         "load": round(loaded - started, 3),
         "check": round(time.perf_counter() - loaded, 3),

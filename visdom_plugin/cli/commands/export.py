@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+from datamodules.built_in import PREFIX, on_disk
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.options import Device, SceneOptions, read_options
 from visdom_plugin.cli.subject import PointCloud, Subject, is_run, is_splat_file, open_subject
@@ -92,7 +93,7 @@ def _export(argv: Sequence[str]) -> None:
 
 def _check(options: Options) -> None:
     """Refuses what cannot go together, before anything is read."""
-    if not options.run.exists():
+    if (place := on_disk(options.run)) is not None and not place.exists():
         raise ConfigError("there is no such file or folder", where=options.run)
     if options.mesh and options.format not in MESHES:
         raise ConfigError(f"--mesh is for {', '.join(MESHES)}", where=f"--format {options.format}")
@@ -144,7 +145,7 @@ def _target(options: Options) -> Path:
             raise ConfigError("this would replace the file itself", where=name, todo="--out NAME")
         return name
     if not is_run(options.run):
-        return Path(f"{options.run.resolve().name}_dataset")
+        return Path(f"{options.run.resolve().name.removeprefix(PREFIX)}_dataset")
     mesh = options.mesh or options.format in ("glb", "obj") or not _has_gaussians(options)
     stem = "dataset" if options.format == "dataset" else "mesh" if mesh else "point_cloud"
     # The run itself may have written mesh.ply and point_cloud.ply.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
+from datamodules.built_in import on_disk
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.options import Device, SceneOptions, read_options
 from visdom_plugin.cli.subject import PointCloud, is_run, is_splat_file, open_subject
@@ -32,7 +33,8 @@ class Options(SceneOptions):
     """
 
     what: tyro.conf.Positional[Path | None] = None
-    """Run directory, folder of a scene, or a .ply, .spz, .splat or .sog file; without it, the built-in scene."""
+    """Run directory, folder of a scene, builtin:NAME, or a .ply, .spz, .splat or .sog file; by default the
+    built-in scene."""
     beside: Path | None = None
     """A second run on the same scene, to compare with."""
     wait: bool = False
@@ -55,7 +57,7 @@ def _view(argv: Sequence[str]) -> None:
     what = options.what
     if what is not None and options.wait:
         wait_for_state(what)
-    if what is not None and not what.exists():
+    if (place := on_disk(what)) is not None and not place.exists():
         raise ConfigError("there is no such file or folder", where=what)
     from visdom_plugin.viewer.serve import choose_port, describe_address
 

@@ -80,15 +80,17 @@ def find_target(root: Path | None, given: str | None, frame: int | None) -> Path
     """The mesh file of the true surface: the one given, else the scene's own; None where there is none.
 
     Args:
-        root: the scene's folder; None for the built-in scene, which knows its surface.
+        root: the scene's folder, or the name of a built-in scene, which knows its surface.
         given: a mesh file that the user names.
         frame: of a video layout.
     """
+    from datamodules.built_in import on_disk
     from datamodules.files.target_mesh import find_mesh
 
     if given is not None:
         return Path(given).expanduser()
-    return None if root is None else find_mesh(root, frame)
+    folder = on_disk(root)
+    return None if folder is None else find_mesh(folder, frame)
 
 
 def with_target(scene: Scene, root: Path | None, given: str | None) -> Scene:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from datamodules.built_in import PREFIX
 from visdom_plugin import registry
 from visdom_plugin.cli.early import WORD, read_early
 from visdom_plugin.cli.options import Common, Request, choose_budget, name_method, resolve_device
@@ -118,7 +119,8 @@ def make_spec(method: str, options: AblationOptions) -> TableSpec:
     # A hull's settings are none of the variants that have no hull.
     rows = tuple(replace(row, settings=_fitting(row, known[row.method])) for row in rows)
     spec = TableSpec(
-        name=f"{NAME}-{base}" + ("" if options.data is None else f"-{options.data.resolve().name}"),
+        name=f"{NAME}-{base}"
+        + ("" if options.data is None else f"-{options.data.resolve().name.removeprefix(PREFIX)}"),
         title=f"Paired ablation of {base}",
         rows=rows,
         columns=(Column("built-in"),),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from datamodules.built_in import DEFAULT, named_built_in, on_disk
 from visdom_plugin.cli.options import resolve_device
 from visdom_plugin.errors import ConfigError, unknown_name
 from visdom_plugin.tables.results import Results
@@ -174,12 +175,17 @@ def change_spec(spec: TableSpec, options: TableOptions) -> TableSpec:
     """The table with what the command line puts in its place."""
     columns = spec.columns
     if options.data is not None:
-        if not options.data.expanduser().is_dir():
+        built_in, folder = named_built_in(options.data), on_disk(options.data)
+        if folder is not None and not folder.expanduser().is_dir():
             raise ConfigError(
                 f"there is no folder {options.data}", where="--data", todo="name a scene's folder"
             )
         views = options.views or columns[0].views
-        columns = (Column(options.data.resolve().name, "data", (".",), views),)
+        columns = (
+            Column(built_in, BUILT_IN, (BUILT_IN if built_in == DEFAULT else built_in,), views)
+            if built_in
+            else Column(options.data.resolve().name, "data", (".",), views),
+        )
     if options.views:
         columns = tuple(replace(column, views=options.views) for column in columns)
     if options.downscale is not None:
@@ -235,8 +241,8 @@ def _read_roots(spec: TableSpec, options: TableOptions) -> dict[str, Path]:
                 else ConfigError(what, where=f"--root {text}", todo="leave it out")
             )
         roots[name] = Path(folder)
-    if options.data is not None:
-        roots["data"] = options.data
+    if (data := on_disk(options.data)) is not None:
+        roots["data"] = data
     return roots
 
 

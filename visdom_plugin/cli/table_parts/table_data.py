@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from datamodules.built_in import named_built_in
 from visdom_plugin.cli.options import READING, Common, resolve_lists
 from visdom_plugin.errors import ConfigError, SceneError, unknown_name
 from visdom_plugin.tables.spec import Settings
@@ -52,7 +53,7 @@ class DataHasher:
 
         Args:
             kind: of the table; the true surface counts for those that measure against it.
-            folder: the scene's; None for the built-in scene.
+            folder: the scene's; None, or builtin:NAME, for a built-in scene.
             reading: how it is read, `views` and `downscale` among it.
             settings: the job's resolved settings.
 
@@ -60,12 +61,13 @@ class DataHasher:
             SceneError: for a scene that cannot be read.
             ConfigError: for a reading that does not fit the scene.
         """
-        if folder is None:
+        if _name_built_in(folder) is not None:
             from datamodules.synthetic.config import SyntheticConfig
 
             SyntheticConfig(train_views=int(str(reading["views"]))).check()
             found, digest = None, self._once("built-in", hash_built_in)
         else:
+            assert folder is not None
             key = json.dumps([str(folder), dict(reading)], sort_keys=True)
             found = self._once(key, lambda: self._look(folder, reading))
             digest = found.digest
@@ -108,12 +110,21 @@ class DataHasher:
         return self._found[key]
 
 
+def _name_built_in(folder: Path | None) -> str | None:
+    """`named_built_in`, for who reads a table."""
+    try:
+        return named_built_in(folder)
+    except ConfigError as error:
+        cause = "a column without `root:` names built-in scenes; that of a data root needs --root NAME=DIR"
+        raise ConfigError(error.what, cause=cause, todo=error.todo) from error
+
+
 def hash_built_in() -> str:
-    """A hash of the code that draws the built-in scene."""
+    """A hash of the code that draws the built-in scenes."""
     import datamodules
 
     digest = hashlib.sha256()
-    for path in sorted((Path(datamodules.__file__).parent / "synthetic").glob("*.py")):
+    for path in sorted((Path(datamodules.__file__).parent / "synthetic").rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

@@ -39,7 +39,7 @@ class VisdomDataParserConfig(DataParserConfig):
 
     _target: type = field(default_factory=lambda: VisdomDataParser)
     data: Optional[Path] = None  # noqa: UP045  (nerfstudio's reader of configs)
-    """Folder of the scene, in any layout of visdom-train; without it, the built-in scene."""
+    """Folder of the scene, in any layout of visdom-train, or builtin:NAME; without it, the built-in scene."""
     views: int = 4
     """Training views."""
     downscale: float = 1.0

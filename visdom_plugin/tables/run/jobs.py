@@ -122,7 +122,7 @@ def plan(spec: TableSpec, runs: Path, workshop: Workshop, roots: Mapping[str, Pa
     readings = [workshop.tidy_reading(column.reading, _place(spec, column)) for column in spec.columns]
     refuse_mixture(_facts(spec, resolved), spec.varies, spec.source)
     folders = [_find_scenes(spec, column, dict(roots or {})) for column in spec.columns]
-    looked_at = {path for scenes in folders if scenes for path in scenes.values() if path is not None}
+    looked_at = {path for scenes in folders if scenes for path in scenes.values() if path and path.is_dir()}
     if looked_at:
         log.info("reading the files of %d scene%s", len(looked_at), "s" * (len(looked_at) != 1))
     jobs: dict[Job, Outcome] = {}
@@ -176,9 +176,10 @@ def _facts(spec: TableSpec, resolved: list[Resolved | None]) -> list[Fact]:
 
 
 def _find_scenes(spec: TableSpec, column: Column, roots: dict[str, Path]) -> dict[str, Path | None] | None:
-    """Scene name to folder (None for the built-in scene); None, with a warning, where the root is not here."""
+    """Scene name to folder (None, or builtin:NAME, for a built-in scene); None, with a warning, where the root is
+    not here."""
     if column.root == BUILT_IN:
-        return {BUILT_IN: None}
+        return {name: None if name == BUILT_IN else Path(f"builtin:{name}") for name in column.scenes}
     root = find_root(column.root, roots)
     if root is None:
         log.warning(
@@ -219,16 +220,16 @@ def _make_task(
     runs: Path,
     workshop: Workshop,
 ) -> Task:
-    trouble = ""
+    trouble, column = "", spec.columns[job.column]
     try:
         data = workshop.hash_data(spec.kind, folder, reading, found.config)
     except SceneError as error:
         # Its run fails with the same words and does not stop the others; once mended it is another run.
         trouble, data = str(error), f"cannot be read: {error}"
     except ConfigError as error:
-        raise _within(_place(spec, spec.columns[job.column]), error) from error
+        raise _within(_place(spec, column), error) from error
     settings = as_plain(found.config)
-    scene = folder.name if folder is not None else job.scene
+    scene = job.scene if folder is None or column.root == BUILT_IN else folder.name
     identity = {
         "kind": spec.kind,
         "method": found.name,

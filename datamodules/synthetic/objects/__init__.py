@@ -1,0 +1,1 @@
+"""Built-in objects, each a surface and its paint."""
