@@ -69,7 +69,6 @@ def test_an_edition_is_the_table_with_its_entries_put_in(file):
         ({"name": "../../elsewhere"}, "cannot be called '../../elsewhere'"),
         ({"name": ".."}, "cannot be called"),
         ({"name": ""}, "cannot be called"),
-        ({"columns": [{"label": "a", "scenes": ["kitchen"]}]}, "root"),
         ({"columns": []}, "no columns"),
         ({"rows": [{"label": "a"}]}, "no method"),
         ({"rows": [{"label": "a", "method": "b"}] * 2}, "two rows have the label 'a'"),

@@ -156,3 +156,20 @@ def test_what_a_reading_may_hold_reaches_the_run():
     assert tidy_reading(given, "here") == given and set(given) | set(OWN) == set(READING)
     with pytest.raises(ConfigError, match=r"reading\.frame cannot be 'first'"):
         tidy_reading({"frame": "first"}, "here")
+
+
+def test_a_column_names_built_in_scenes(tmp_path, capsys):
+    (tmp_path / "two.yaml").write_text(
+        "name: two\nrows: [{label: a, method: ingp}]\ncolumns: [{label: drawn, scenes: [built-in, duck]}]\n"
+    )
+    words = [str(tmp_path / "two.yaml"), "--out", str(tmp_path / "out"), "--dry-run"]
+    assert table.main(words) == 0
+    said = capsys.readouterr().out
+    assert "| built-in | 4 |" in said and "| duck | 4 |" in said and "2 runs" in said
+    assert table.main([*words, "--data", "builtin:figure"]) == 0
+    assert "| figure | 4 |" in capsys.readouterr().out
+    (tmp_path / "two.yaml").write_text((tmp_path / "two.yaml").read_text().replace("duck", "kitchen"))
+    assert table.main(words) == 2
+    said = capsys.readouterr().err
+    assert "there is no built-in scene 'builtin:kitchen'" in said and "without `root:`" in said
+    assert "builtin:chair" in said and "two.yaml" in said
