@@ -13,7 +13,7 @@ from tests.hull.balls import ball_masks, box_masks, random_cameras, random_masks
 from visdom_plugin.geometry.camera_paths import look_at_camera
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving import culling
-from visdom_plugin.hull.carving.octree import sum_areas
+from visdom_plugin.hull.carving.areas import sum_areas
 from visdom_plugin.hull.carving.votes import Grid, gather_silhouettes
 from visdom_plugin.hull.checks.coverage import measure_coverage
 from visdom_plugin.hull.domain import VisibleDomain

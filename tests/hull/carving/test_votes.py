@@ -11,15 +11,10 @@ from hypothesis import strategies as st
 from tests.hull.balls import random_cameras, random_masks
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import project
+from visdom_plugin.hull.carving.areas import sum_areas
+from visdom_plugin.hull.carving.cells import DROPPED, KEPT, classify_cells, keep_centres
 from visdom_plugin.hull.carving.keep_rule import KeepRule, as_fraction
-from visdom_plugin.hull.carving.octree import (
-    DROPPED,
-    KEPT,
-    block_carve,
-    classify_cells,
-    keep_centres,
-    sum_areas,
-)
+from visdom_plugin.hull.carving.octree import block_carve
 from visdom_plugin.hull.carving.votes import Grid, count_votes, dense_carve, gather_silhouettes
 
 

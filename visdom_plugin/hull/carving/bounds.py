@@ -13,9 +13,10 @@ import numpy as np
 import torch
 
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.hull.carving.areas import Areas
+from visdom_plugin.hull.carving.cells import KEPT, MIXED, classify_cells, keep_centres
 from visdom_plugin.hull.carving.culling import explaining_pieces
 from visdom_plugin.hull.carving.keep_rule import KeepRule
-from visdom_plugin.hull.carving.octree import KEPT, MIXED, Areas, classify_cells, keep_centres
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes
 from visdom_plugin.hull.grid.components import find_pieces, piece_of
 
@@ -55,7 +56,7 @@ class Search(NamedTuple):
 
     silhouettes: Silhouettes
     areas: Areas
-    """From `octree.sum_areas`."""
+    """From `areas.sum_areas`."""
     rule: KeepRule
     components: str = "all"
     """Which pieces the box must hold: "all"; with "explain" those that explain foreground of their own; with any

@@ -10,10 +10,11 @@ import numpy as np
 
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import Cameras
+from visdom_plugin.hull.carving.areas import sum_areas
 from visdom_plugin.hull.carving.bounds import Region, Search, cube_around, find_region, grid_in
 from visdom_plugin.hull.carving.culling import explaining_pieces
 from visdom_plugin.hull.carving.keep_rule import KeepRule
-from visdom_plugin.hull.carving.octree import block_carve, sum_areas
+from visdom_plugin.hull.carving.octree import block_carve
 from visdom_plugin.hull.carving.votes import Device, Grid, Silhouettes, dense_carve
 from visdom_plugin.hull.grid.components import Pieces, choose_pieces, erase_pieces, find_pieces
 from visdom_plugin.hull.hull import Hull, occupied_box

@@ -15,8 +15,8 @@ import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
+from visdom_plugin.hull.carving.areas import Areas
 from visdom_plugin.hull.carving.keep_rule import KeepRule
-from visdom_plugin.hull.carving.octree import Areas
 from visdom_plugin.hull.carving.votes import Grid, Silhouettes, axis_terms
 from visdom_plugin.hull.grid.components import Pieces
 
@@ -69,7 +69,7 @@ def explaining_pieces(
     Args:
         pieces: of `occupancy`, (X, Y, Z) bool, in `grid`.
         rule: what the pieces satisfy. Undecided cells seldom cover foreground in as many views as it asks for.
-        areas: from `octree.sum_areas`.
+        areas: from `areas.sum_areas`.
 
     Returns:
         (C,) bool, at least one True where there are pieces.
