@@ -9,6 +9,7 @@ from method_configs import (
     fsgs_lite,
     gs_go,
     ingp,
+    splatfields_lite,
     visdom_field,
     visdom_gs,
     zerorf_lite,
@@ -32,8 +33,8 @@ SMALL_INGP = {
 }
 
 
-def splat_presets(name: str, target: str, module) -> list[Preset]:
-    bare = replace(module.SPEC.quick, **SMALL_SPLATS, mask_weight=0.0)
+def splat_presets(name: str, target: str, module, **small) -> list[Preset]:
+    bare = replace(module.SPEC.quick, **SMALL_SPLATS, **small, mask_weight=0.0)
     regularizer = RegularizerConfig(enabled=True, weight=0.1, prune_every=10, bank=4)
     # Wide, as the bare methods' hull is: it is the losses' doing that opacity falls.
     vd = replace(bare, mask_weight=1.0, hull=HULL, vd=regularizer, lr_opacity=0.1)
@@ -59,6 +60,9 @@ def built_in() -> list[Preset]:
     found += splat_presets("SmallGsGo", "visdom_plugin.methods.splats.gs_go:GsGo", gs_go)
     found += splat_presets("SmallCorgs", "visdom_plugin.methods.splats.corgs_lite:CorgsLite", corgs_lite)
     found += splat_presets("SmallFsgs", "visdom_plugin.methods.splats.fsgs.method:FsgsLite", fsgs_lite)
+    splatfields = "visdom_plugin.methods.splats.splatfields.method:SplatFieldsLite"
+    narrow = {"noise_size": 2, "decoder_width": 4, "lr_field": 2e-2}
+    found += splat_presets("SmallSplatFields", splatfields, splatfields_lite, **narrow)
     found.append(
         recipe("SmallVisdomGs", visdom_gs, SMALL_SPLATS | {"vd": RegularizerConfig(enabled=True, bank=4)})
     )
@@ -99,6 +103,7 @@ WHOLE = (
     "SmallGsGo",
     "SmallCorgs",
     "SmallFsgs",
+    "SmallSplatFields",
     "SmallVisdomGs",
     "SmallIngp",
     "SmallVisdomField",

@@ -24,6 +24,7 @@ VARIANTS = (
     "corgs-lite+vd",
     "3dgs-go",
     "fsgs-lite+vd",
+    "splatfields-lite+vd",
 )
 EXACT = (2.0**-20, 2.0**12)
 """Powers of two change no mantissa: every number must stay as it is, to the last bit."""
@@ -68,6 +69,9 @@ def numbers(name: str, scene):
         "floater_every": 5,
         "pseudo_from": 0,
         "co_prune_every": 4,
+        "decoder_width": 4,
+        "mlp_width": 16,
+        "moran_weight": 0.01,
     }
     config = replace(preset.quick, **{k: v for k, v in small.items() if hasattr(preset.quick, k)})
     if config.hull is not None:

@@ -8,7 +8,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
-from method_configs import corgs_lite, fsgs_lite, gs_go, ingp, zerorf_lite, zipnerf_lite
+from method_configs import corgs_lite, fsgs_lite, gs_go, ingp, splatfields_lite, zerorf_lite, zipnerf_lite
 from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.fields.ingp import Ingp
@@ -17,6 +17,7 @@ from visdom_plugin.methods.fields.zipnerf_lite import ZipNerfLite
 from visdom_plugin.methods.splats.corgs_lite import CorgsLite
 from visdom_plugin.methods.splats.fsgs.method import FsgsLite
 from visdom_plugin.methods.splats.gs_go import GsGo
+from visdom_plugin.methods.splats.splatfields.method import SplatFieldsLite
 from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.run import choose_batches
@@ -26,6 +27,9 @@ SPLATS = {
     GsGo: replace(gs_go.SPEC.quick, steps=40, initial_points=300, depth_weight=0.0),
     CorgsLite: replace(corgs_lite.SPEC.quick, steps=40, initial_points=300),
     FsgsLite: replace(fsgs_lite.SPEC.quick, steps=40, initial_points=300),
+    SplatFieldsLite: replace(
+        splatfields_lite.SPEC.quick, steps=40, initial_points=300, noise_size=2, moran_weight=0.01
+    ),
 }
 METHODS = SPLATS | {
     Ingp: replace(

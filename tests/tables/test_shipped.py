@@ -90,7 +90,15 @@ def test_every_number_of_the_paper_stands_in_its_table(name):
 
 def test_an_edition_of_the_main_table_has_every_variant_of_every_method():
     rows = {row.method for row in load_table("main", "smoke").rows}
-    methods = ("ingp", "zipnerf-lite", "zerorf-lite", "3dgs-go", "fsgs-lite", "corgs-lite")
+    methods = (
+        "ingp",
+        "zipnerf-lite",
+        "zerorf-lite",
+        "3dgs-go",
+        "splatfields-lite",
+        "fsgs-lite",
+        "corgs-lite",
+    )
     assert rows == {m + v for m in methods for v in ("", "+mask", "+vd")}
     assert load_table("main", "captures").seeds == (0, 1, 2)
 

@@ -11,6 +11,7 @@ from visdom_plugin.cli import options
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.methods.splats.configs import CorgsConfig, GsGoConfig
 from visdom_plugin.methods.splats.fsgs.config import FsgsConfig
+from visdom_plugin.methods.splats.splatfields.config import SplatFieldsConfig
 from visdom_plugin.splat.set_config import GaussianSetConfig
 
 SHARED = {
@@ -74,6 +75,20 @@ OWN = {
         "pseudo_weight": -1.0,
         "pseudo_ramp": -1,
     },
+    SplatFieldsConfig: {
+        "noise_channels": 0,
+        "noise_size": 0,
+        "plane_channels": 0,
+        "decoder_width": 0,
+        "mlp_depth": 0,
+        "mlp_width": 0,
+        "lr_field": 0.0,
+        "lr_field_final": -1.0,
+        "lr_field_steps": 0,
+        "mask_l1_weight": -1.0,
+        "norm_weight": -1.0,
+        "moran_weight": -1.0,
+    },
 }
 WRONG = [
     (kind, name, value) for kind, own in OWN.items() for name, value in (SHARED | BOTH | own).items()
@@ -119,7 +134,8 @@ def test_the_command_line_refuses_it_too(words):
 
 def test_settings_load_without_torch():
     code = (
-        "import sys, method_configs.corgs_lite, method_configs.gs_go, method_configs.fsgs_lite\n"
+        "import sys\n"
+        "from method_configs import corgs_lite, fsgs_lite, gs_go, splatfields_lite\n"
         "print([m for m in ('torch', 'numba', 'cv2', 'scipy') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

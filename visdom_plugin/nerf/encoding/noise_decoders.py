@@ -7,6 +7,7 @@ the only prior there is (Ulyanov et al. 2018).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -32,11 +33,19 @@ class PlaneDecoder(nn.Module):
         inputs: channels of the noise.
         width: channels of the finest level; a coarse one has up to eight times as many.
         generator: on the CPU; draws the weights.
+        multiples: channels of the five levels in widths, from coarse to fine.
     """
 
-    def __init__(self, inputs: int, outputs: int, width: int, generator: Generator):
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        width: int,
+        generator: Generator,
+        multiples: Sequence[int] = PLANE_WIDTHS,
+    ):
         super().__init__()
-        widths = [width * n for n in PLANE_WIDTHS]
+        widths = [width * n for n in multiples]
         self.first = _convolution(inputs, widths[0], generator)
         self.middle = nn.Sequential(
             Residual(widths[0], widths[0], generator),
