@@ -33,11 +33,13 @@ SMALL_INGP = {
 }
 
 
-def splat_presets(name: str, target: str, module, **small) -> list[Preset]:
+def splat_presets(
+    name: str, target: str, module, *, mask_weight: float = 1.0, weight: float = 0.1, **small
+) -> list[Preset]:
     bare = replace(module.SPEC.quick, **SMALL_SPLATS, **small, mask_weight=0.0)
-    regularizer = RegularizerConfig(enabled=True, weight=0.1, prune_every=10, bank=4)
+    regularizer = RegularizerConfig(enabled=True, weight=weight, prune_every=10, bank=4)
     # Wide, as the bare methods' hull is: it is the losses' doing that opacity falls.
-    vd = replace(bare, mask_weight=1.0, hull=HULL, vd=regularizer, lr_opacity=0.1)
+    vd = replace(bare, mask_weight=mask_weight, hull=HULL, vd=regularizer, lr_opacity=0.1)
     return [Preset(name, "", target, bare, bare), Preset(f"{name}+vd", "", target, vd, vd)]
 
 
@@ -61,8 +63,18 @@ def built_in() -> list[Preset]:
     found += splat_presets("SmallCorgs", "visdom_plugin.methods.splats.corgs_lite:CorgsLite", corgs_lite)
     found += splat_presets("SmallFsgs", "visdom_plugin.methods.splats.fsgs.method:FsgsLite", fsgs_lite)
     splatfields = "visdom_plugin.methods.splats.splatfields.method:SplatFieldsLite"
-    narrow = {"noise_size": 2, "decoder_width": 4, "lr_field": 2e-2}
-    found += splat_presets("SmallSplatFields", splatfields, splatfields_lite, **narrow)
+    # Bare it starts in the masks' own hull, and has a mask loss; here in the same wide one. A field cannot shrink
+    # single Gaussians: in few steps it takes a stronger L_i, beside a mask loss that does not drown it.
+    narrow = {
+        "noise_size": 2,
+        "decoder_width": 4,
+        "lr_field": 1e-2,
+        "lr_field_final": 1e-3,
+        "lr_field_steps": 24,
+    }
+    found += splat_presets(
+        "SmallSplatFields", splatfields, splatfields_lite, mask_weight=0.1, weight=1.0, hull=HULL, **narrow
+    )
     found.append(
         recipe("SmallVisdomGs", visdom_gs, SMALL_SPLATS | {"vd": RegularizerConfig(enabled=True, bank=4)})
     )
