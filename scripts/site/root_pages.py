@@ -19,6 +19,11 @@ PAGES = {
     "CONTRIBUTING.md": "contributing.md",
 }
 """Files at the top of the tree by their place on the site."""
+EXAMPLES_HEAD = """# Examples
+
+Scripts of `examples/`, from simple to less so. Each runs as it stands; `--help` shows its settings. The notebook
+`examples/08_photographs_to_picture.ipynb` goes from photographs to pictures.
+"""
 _CODE = r"^```.*?^```$|`[^`\n]*`"
 _LINK = re.compile(rf"{_CODE}|(!?)\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)", re.M | re.S)
 
@@ -46,7 +51,7 @@ def relink(text: str, source: str, place: str) -> str:
 
 def show_examples() -> str:
     """The scripts of examples/ with what their docstrings say."""
-    parts = ["# Examples\n\nScripts of `examples/`, from simple to less so. Each runs as it stands.\n"]
+    parts = [EXAMPLES_HEAD]
     for path in sorted((ROOT / "examples").rglob("*.py")):
         source = path.read_text(encoding="utf-8")
         name, said = path.relative_to(ROOT).as_posix(), ast.get_docstring(ast.parse(source))
