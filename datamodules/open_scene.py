@@ -64,6 +64,7 @@ def choose_files(capture: Capture, request: Request) -> Chosen:
             where=capture.root,
             cause="the file of poses lists none, or was copied only in part",
             todo="copy or export the poses again",
+            topic="no-scene",
         )
     _check_names(capture, request)
     names = [frame.name for frame in capture.frames]
@@ -193,6 +194,7 @@ def _check_names(capture: Capture, request: Request) -> None:
                 if twice
                 else "positions in the index files and masks are found by this name",
                 todo="list each photograph once" if twice else "rename one of them",
+                topic="photograph",
             )
 
 
@@ -217,6 +219,7 @@ def _photographs(capture: Capture, downscale: float, request: Request) -> tuple[
         todo=f"pass --downscale {printable(others[0].rpartition('_')[2])}"
         if others
         else "put the photographs there",
+        topic="photograph",
     )
 
 
@@ -266,12 +269,14 @@ def _refuse_absent(there: ImageFiles, absent: Sequence[str]) -> None:
             where=path,
             cause=f"photographs in a format that is not read, {printable(other.suffix)}",
             todo="convert them to PNG or JPEG",
+            topic="photograph",
         )
     raise SceneError(
         f"{what}: {list_some([printable(name) for name in absent])}",
         where=path,
         cause="the scene was copied only in part, or the photographs were renamed",
         todo="copy them there, or list only views that have one, with --train-list and --test-list",
+        topic="photograph",
     )
 
 

@@ -176,6 +176,7 @@ def find_folder(path: str | Path, todo: str = _SCENE_TODO) -> Path:
             "this is a file, not a folder" if exists else "there is no such folder",
             where=root,
             todo=todo,
+            topic="no-scene",
         )
     return root
 
@@ -218,7 +219,10 @@ def read_capture(root: Path, data_format: str | None, request: Request) -> Captu
 def _check_format(data_format: str | None) -> None:
     if data_format is not None and data_format not in FORMATS:
         raise ConfigError(
-            f"unknown data format {data_format!r}", where="--data-format", todo=f"one of {', '.join(FORMATS)}"
+            f"unknown data format {data_format!r}",
+            where="--data-format",
+            todo=f"one of {', '.join(FORMATS)}",
+            topic="layout",
         )
 
 
@@ -234,6 +238,7 @@ def _only_reading(root: Path) -> str:
             + " or ".join(f"{name} ({reason})" for name, reason in found.items()),
             where=root,
             todo=f"say which one is meant: --data-format {' or --data-format '.join(found)}",
+            topic="layout",
         )
     layouts = "; ".join(f"{name}: {form.holds}" for name, form in FORMATS.items() if form.recogniser)
     raise SceneError(
@@ -241,6 +246,7 @@ def _only_reading(root: Path) -> str:
         where=root,
         cause=_guess(root),
         todo=f"pass a folder of one of these layouts, or name it with --data-format. {layouts}",
+        topic="no-scene",
     )
 
 

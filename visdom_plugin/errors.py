@@ -4,6 +4,22 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import ClassVar
+
+PAGE = "docs/guide/troubleshooting.md"
+"""The page that tells more of every topic, under its name."""
+TOPICS = (
+    # of a class, for what has no narrower one
+    "scene", "empty-hull", "setting", "run", "plugin",
+    # photographs, masks and poses on disk
+    "no-scene", "layout", "missing-file", "damaged-file", "outside-path", "photograph", "photograph-size",
+    "mask-missing", "mask-ambiguous", "poses", "lens", "which-views", "depth",
+    # preparing photographs
+    "no-board", "several-lenses", "focal-length", "no-object", "unmatched-poses",
+    # settings, runs, what is installed, and trainers
+    "unknown-name", "contradiction", "other-run", "busy-run", "not-installed", "weights", "render",
+)  # fmt: skip
+"""What errors are about, beside what findings of the check are called: names that stay, and anchors of `PAGE`."""
 
 
 class VisDomError(Exception):
@@ -16,10 +32,23 @@ class VisDomError(Exception):
         where: The file, view or field it was found in.
         cause: The likeliest cause, when it could be established.
         todo: What to do, ideally the command to run next.
+        topic: What it is about, where that is narrower than the class: one of `TOPICS`, or a finding's kind.
     """
 
-    def __init__(self, what: str, *, where: object = None, cause: str | None = None, todo: str | None = None):
+    usual: ClassVar[str] = "setting"
+    """The topic of errors of this class that are given none."""
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: object = None,
+        cause: str | None = None,
+        todo: str | None = None,
+        topic: str | None = None,
+    ):
         self.what, self.where, self.cause, self.todo = what, where, cause, todo
+        self.topic = topic or self.usual
         lines = [what]
         if where is not None:
             lines.append(f"  where: {where}")
@@ -33,9 +62,13 @@ class VisDomError(Exception):
 class SceneError(VisDomError):
     """The data on disk, or the cameras and masks handed in, cannot be used as they are."""
 
+    usual = "scene"
+
 
 class EmptyHullError(VisDomError):
     """No voxel satisfies the keep rule."""
+
+    usual = "empty-hull"
 
 
 class ConfigError(VisDomError):
@@ -45,9 +78,18 @@ class ConfigError(VisDomError):
 class CheckpointError(VisDomError):
     """A run directory or checkpoint cannot be resumed or read."""
 
+    usual = "run"
+
 
 class PluginError(VisDomError):
     """A method or hook registered from outside cannot be used."""
+
+    usual = "plugin"
+
+
+def say_more(topic: str) -> str:
+    """The line that ends a message of the commands."""
+    return f"  more: {PAGE}#{topic}"
 
 
 def list_some(names: Iterable[object], most: int = 5) -> str:
@@ -84,4 +126,5 @@ def unknown_name(
         where=where,
         cause=cause,
         todo=f"{todo}: {', '.join(names) or '(there is none)'}",
+        topic="unknown-name",
     )

@@ -122,6 +122,7 @@ class Views:
                 where=", ".join(self.names[:5]),
                 cause="masks are neither in the folder masks nor in the photographs' alpha channels",
                 todo=NO_MASKS,
+                topic="mask-missing",
             )
         ignored = [self.ignored(i) for i in given]
         masks = [

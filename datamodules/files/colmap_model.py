@@ -95,6 +95,7 @@ def read_model(root: Path, folder: str, *, outside: bool = False) -> Model:
         "no COLMAP model: neither cameras.bin with images.bin nor cameras.txt with images.txt",
         where=root / folder,
         todo="put the model's files there; colmap model_converter turns one form into the other",
+        topic="no-scene",
     )
 
 
@@ -114,6 +115,7 @@ def cameras_of(model: Model, images: Sequence[Registered]) -> tuple[Cameras, lis
                 where=model.folder,
                 cause="the cameras and images files come from different models, or one is damaged",
                 todo="export both from the same reconstruction",
+                topic="poses",
             )
         matrix, distortion = _lens(lens, image.name, model)
         K.append(matrix)
@@ -124,6 +126,7 @@ def cameras_of(model: Model, images: Sequence[Registered]) -> tuple[Cameras, lis
                 where=model.folder,
                 cause="a pose that was never filled in",
                 todo="drop the view from the model and the index files, or estimate its pose again",
+                topic="poses",
             )
         rotations.append(image.quaternion)
         translations.append(image.translation)
@@ -152,6 +155,7 @@ def _lens(lens: Intrinsics, name: str, model: Model) -> tuple[tuple[float, ...],
             where=model.folder,
             cause="the photographs still have their lens distortion" if known else None,
             todo=advise_undistorting(*(str(PurePosixPath(file).parent) for file in model.files[:1])),
+            topic="lens",
         )
     if lens.model in _ONE_FOCAL:
         fx, cx, cy, *rest = lens.params

@@ -49,6 +49,7 @@ def choose_model(root: Path, asked: str | None) -> tuple[str | None, list[str]]:
                 todo=f"--colmap-model with one of {', '.join(there)}"
                 if there
                 else "put cameras and images there",
+                topic="no-scene",
             )
         return asked.strip("/"), []
     if len(there) < 2:

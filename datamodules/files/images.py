@@ -190,6 +190,7 @@ def decode_depth(data: bytes, path: Path) -> np.ndarray:
             where=path,
             cause="the coloured preview was saved in its place",
             todo=f"save depth x 1000 as 16-bit PNG, or remove the folder {path.parent.name} to train without it",
+            topic="depth",
         )
     return image.astype(np.float32) / np.float32(1000)
 
@@ -206,6 +207,7 @@ def _depth_array(data: bytes, path: Path) -> np.ndarray:
             f"{depth.dtype}",
             where=path,
             todo="save the depth alone with numpy.save, larger where farther, 0 where unknown",
+            topic="depth",
         )
     depth = depth.astype(np.float32)
     return np.where(np.isfinite(depth), depth, np.float32(0))
@@ -273,6 +275,7 @@ def _kind(data: bytes, path: Path) -> str:
         where=path,
         cause="another format behind this extension, or an interrupted copy",
         todo="convert it to PNG or JPEG, or copy it again",
+        topic="photograph",
     )
 
 
@@ -287,6 +290,7 @@ def _open(data: bytes, kind: str, path: Path) -> tuple[ImageFile, int]:
             f"the file is {kind}, which is not read here yet",
             where=path,
             todo=f"pip install {extra}, or convert it to PNG or JPEG",
+            topic="photograph",
         ) from error
     stream = io.BytesIO(data)
     return plugin(stream), stream.tell()

@@ -84,6 +84,7 @@ def decode_mask(data: bytes, path: Path) -> Mask:
             where=path,
             cause="a mask that was saved with an alpha channel of another one",
             todo="save it as a grey image without alpha channel",
+            topic="mask-ambiguous",
         )
     return _measured(alpha)
 
@@ -105,6 +106,7 @@ def _find_labels(data: bytes, path: Path, pixels: np.ndarray) -> tuple[np.ndarra
                     where=path,
                     cause="a picture reduced to a palette, whose order says nothing",
                     todo="save the mask as a grey image with 0 and 255",
+                    topic="mask-ambiguous",
                 )
             labels = used[(used > 0) & (used <= LARGEST_LABEL)]
             return indices, _VOID if used[-1] == _VOID and 0 < len(labels) >= len(used) - 2 else None
@@ -135,6 +137,7 @@ def _find_labels(data: bytes, path: Path, pixels: np.ndarray) -> tuple[np.ndarra
             cause="a label image whose void value covers more than outlines, or a mask with marks in the dark",
             todo="save masks with 0 and 255 alone; what is unknown goes into a file of the same name in the "
             "folder ignore, white where nothing is known",
+            topic="mask-ambiguous",
         )
     return grey, int(values[-1])
 
@@ -191,6 +194,7 @@ def refuse_two(file: Mask, alpha: Mask, file_path: Path, image_path: Path) -> No
             f"two masks that disagree: the file {file_path.name} and the alpha channel of {image_path.name}",
             where=f"{file_path} and {image_path}",
             todo="say which one is meant: --data.mask-source folder, or --data.mask-source alpha",
+            topic="mask-ambiguous",
         )
 
 
@@ -220,7 +224,9 @@ def refuse_empty(mask: np.ndarray, peak: float, path: Path) -> None:
             "the segmentation found nothing in this view",
             "mask the object, drop the view, or remove the file and pass --data.missing-masks colour|hull",
         )
-    raise SceneError("the mask is empty: no pixel of it is foreground", where=path, cause=cause, todo=todo)
+    raise SceneError(
+        "the mask is empty: no pixel of it is foreground", where=path, cause=cause, todo=todo, topic="empty"
+    )
 
 
 def soft_share(opacity: np.ndarray) -> float:

@@ -28,7 +28,7 @@ def damaged(
     todo: str = "copy the file again or export it again",
 ) -> NoReturn:
     """Raises SceneError about a file."""
-    raise SceneError(what, where=path, cause=cause, todo=todo)
+    raise SceneError(what, where=path, cause=cause, todo=todo, topic="damaged-file")
 
 
 def decode_text(

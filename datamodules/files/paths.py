@@ -41,6 +41,7 @@ def check_name(relative: str, where: Path, *, outside: bool = False) -> None:
             f"the data names a file outside its folder: {_shown(relative)}",
             where=where,
             todo=f"name each image by its path below the scene's folder, or {_OPTION}",
+            topic="outside-path",
         )
 
 
@@ -70,6 +71,7 @@ def inside(root: Path, relative: str, *, outside: bool = False) -> Path:
             where=f"{path} -> {real}",
             cause="files outside the data folder are never read",
             todo=f"copy the file into the folder, or {_OPTION}",
+            topic="outside-path",
         )
     return path
 
@@ -99,6 +101,7 @@ def read_plain(path: Path, most: int = MOST_BYTES) -> bytes:
             where=path,
             cause="a repository cloned without Git LFS, or downloaded as an archive",
             todo="git lfs install && git lfs pull, in the repository",
+            topic="missing-file",
         )
     return data
 
@@ -117,6 +120,7 @@ def read_file(path: Path, most: int = MOST_BYTES) -> bytes:
             where=path,
             cause="the scene was copied only in part",
             todo="copy it there",
+            topic="missing-file",
         ) from None
     except (OSError, ValueError) as error:
         raise SceneError(

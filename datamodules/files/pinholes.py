@@ -49,6 +49,7 @@ def pinholes(
                 where=where,
                 cause="a damaged file, or a calibration that failed",
                 todo="export the cameras again",
+                topic="poses",
             )
         if not np.isfinite(pose).all() or np.abs(pose[:, 3]).max() > 1e15:
             raise SceneError(
@@ -56,6 +57,7 @@ def pinholes(
                 where=where,
                 cause="the pose estimation failed for this view, or the file is damaged",
                 todo="drop the view from the data, or estimate its pose again",
+                topic="poses",
             )
         off = np.abs(pose[:, :3].T @ pose[:, :3] - np.eye(3)).max() if np.abs(pose[:, :3]).max() < 2 else 9.0
         if off > 1e-3 or np.linalg.det(pose[:, :3]) < 0:
@@ -64,6 +66,7 @@ def pinholes(
                 where=where,
                 cause="a scaled or mirrored pose, or a damaged file",
                 todo="remove scale and reflection from the matrices, or estimate the poses again",
+                topic="poses",
             )
     matrices, poses = np.zeros((len(names), 3, 3)), np.zeros((len(names), 4, 4))
     matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]] = K

@@ -57,6 +57,7 @@ class Distortion:
                 where=where,
                 cause="OpenCV has no inverse of this model",
                 todo=advise_undistorting(),
+                topic="lens",
             )
         expected = COEFFICIENTS[self.model]
         if len(self.coefficients) != expected or not all(abs(c) < 1e9 for c in self.coefficients):
@@ -65,6 +66,7 @@ class Distortion:
                 where=where,
                 cause="a damaged file, or a calibration that failed",
                 todo="export the cameras again",
+                topic="lens",
             )
 
 
@@ -131,6 +133,7 @@ def undistort(
             where=where,
             cause="coefficients in another order or unit, or a calibration that failed",
             todo="calibrate again, or undistort the photographs with the program that made the model",
+            topic="lens",
         )
 
     def nearest(values: np.ndarray) -> np.ndarray:

@@ -207,4 +207,5 @@ def _choose_frame(root: Path, folder: str, cameras: list[dict], request: Request
         where=root / folder / "rgbs",
         cause="the scene was copied only in part",
         todo="they are expected as rgbs/Cam001/Cam001_rgb000000.jpg",
+        topic="no-scene",
     )

@@ -74,6 +74,7 @@ def read_capture(
             "there is no COLMAP model in this folder",
             where=root,
             todo="put cameras.bin and images.bin (or the .txt pair) into sparse/0",
+            topic="no-scene",
         )
     if folder != chosen:
         said = [f"{folder} is read, which the index files were made for, not {chosen}"] if chosen else []
@@ -132,5 +133,6 @@ def _depth_file(root: Path, folder: str, view: str) -> str:
             f"there are two depth maps of one view, {array} and {picture}",
             where=root,
             todo="take one of them away; a preview in colours belongs into another folder",
+            topic="depth",
         )
     return array

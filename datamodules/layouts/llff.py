@@ -86,6 +86,7 @@ def read_capture(
             where=root,
             cause="photographs that were not registered are still in the folder, or the copy is not complete",
             todo="keep exactly the photographs that the poses were estimated for, in the order of their names",
+            topic="poses",
         )
     row_of = {name: i for i, name in enumerate(names)}
     frames = sort_frames([Frame(name, f"images/{name}") for name in names])
@@ -118,7 +119,9 @@ def _list_photographs(root: Path, request: Request) -> list[str]:
             for file in found:
                 check_name(file, folder)
             return found
-    raise SceneError("the folder images is missing", where=root, todo="put the photographs there")
+    raise SceneError(
+        "the folder images is missing", where=root, todo="put the photographs there", topic="photograph"
+    )
 
 
 def _size(hwf: np.ndarray, path: Path) -> tuple[int, int]:

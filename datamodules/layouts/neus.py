@@ -53,6 +53,7 @@ def read(root: Path, request: Request) -> Capture:
             where=root,
             cause="the copy is not complete, or photographs were added or left out",
             todo="keep exactly the photographs that the matrices were made for, in the order of their names",
+            topic="poses",
         )
     places = [request.masks] if request.masks else ["mask", "masks", *OTHER_FOLDERS]
     mask_folder = next((name for name in places if (root / name).is_dir()), "mask")
@@ -129,6 +130,7 @@ def decompose(matrix: np.ndarray, name: str, path: Path) -> tuple[list[float], n
             where=path,
             cause="a pose in place of the product of intrinsics and pose",
             todo="write intrinsics @ world-to-camera as world_mat_<i>",
+            topic="poses",
         )
     # RQ by QR of the turned matrix; signs such that all focal lengths are positive.
     turned, triangle = np.linalg.qr(part[::-1].T)
@@ -144,6 +146,7 @@ def decompose(matrix: np.ndarray, name: str, path: Path) -> tuple[list[float], n
             where=path,
             cause="a matrix that is no product of intrinsics and world-to-camera pose",
             todo="write intrinsics @ world-to-camera as world_mat_<i>",
+            topic="lens",
         )
     centre = -np.linalg.solve(part, matrix[:, 3])
     return [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.concatenate([rotation.T, centre[:, None]], 1)

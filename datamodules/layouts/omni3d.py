@@ -56,6 +56,7 @@ def read(root: Path, request: Request) -> Capture:
             "this object has a rendered and a filmed capture",
             where=root,
             todo=f"name one: {root / 'render'} or {root / 'standard'}",
+            topic="layout",
         )
     base = _base(root, request)
     if (base / "matting").is_dir() or not (base / "transforms.json").is_file():
@@ -109,6 +110,7 @@ def _filmed(root: Path, base: Path, request: Request, *, prefer_llff: bool) -> C
             f"there are no poses: neither a COLMAP model in sparse/ nor {' or '.join(_LLFF)}",
             where=base,
             cause="the scene was copied only in part",
+            topic="no-scene",
         )
     return replace(capture, name=_name(root))
 

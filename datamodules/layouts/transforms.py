@@ -135,6 +135,7 @@ def _entry(frame: Any, index: int, content: dict[str, Any], path: Path) -> Entry
             if rolling
             else "another program's form of the file",
             todo="give each photograph one camera-to-world matrix (x right, y up, z backward) as transform_matrix",
+            topic="poses",
         )
     width, height = (frame.get(key, content.get(key)) for key in ("w", "h"))
     if (width is None) != (height is None):
@@ -194,6 +195,7 @@ def _lens_numbers(scope: dict[str, Any], what: str, path: Path) -> dict[str, flo
             where=path,
             cause="a lens that cannot be undistorted here",
             todo="undistort photographs, masks and ignored pixels alike and give a pinhole: fl_x, fl_y, cx, cy",
+            topic="lens",
         )
     return found
 
@@ -221,6 +223,7 @@ def _distortion(scope: dict[str, Any], what: str, path: Path) -> Distortion | No
             where=path,
             cause="an unusual lens, or a damaged file",
             todo="undistort photographs, masks and ignored pixels alike and give camera_model PINHOLE",
+            topic="lens",
         )
     if k["k4"]:
         raise SceneError(
@@ -363,6 +366,7 @@ def _lens(
             where=file.path,
             cause="another program's dialect",
             todo="give fl_x, fl_y, cx, cy in pixels, for the file or in each frame",
+            topic="poses",
         )
     return (*focal, both.get("cx", dimensions[0] / 2), both.get("cy", dimensions[1] / 2)), dimensions
 

@@ -58,6 +58,7 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> M
                 else "the data itself names each photograph's mask",
                 where=f"--masks {request.masks}",
                 todo="leave out --masks" + (", or --data.mask-source alpha" if alpha else ""),
+                topic="mask-ambiguous",
             )
         return MaskFiles(named)
     photographs = _photographs(capture)
@@ -78,6 +79,7 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> M
                 f"{printable(photographs[i][0])} has more than one mask: {', '.join(map(printable, files))}",
                 where=path,
                 todo="keep the right one",
+                topic="mask-ambiguous",
             )
         found[i] = f"{folder}/{files[0]}"
     missing = [i for i in open_ones if i not in found]
@@ -102,6 +104,7 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> M
             where=path,
             cause=cause,
             todo=todo,
+            topic="mask-missing",
         )
     if shift:
         log.warning("%s: the masks look shifted by %d against the photographs' numbers", path, shift)
@@ -144,6 +147,7 @@ def _find_folder(
             f"there is no folder {printable(folder)} for the masks",
             where=capture.root,
             todo="name one below the scene's folder with --masks",
+            topic="mask-missing",
         )
     others = []
     for path in sorted(capture.root.iterdir()):
@@ -162,6 +166,7 @@ def _find_folder(
             f"the folder {folder} has no masks, and {' and '.join(others)} could stand in for it",
             where=capture.root,
             todo=f"say which holds masks that are white on the object: --masks {others[0]}",
+            topic="mask-missing",
         )
     return None, []
 

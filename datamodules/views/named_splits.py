@@ -47,7 +47,10 @@ def load_rows(name: str) -> tuple[Row, ...]:
     """
     if name not in list_names():
         raise ConfigError(
-            f"there is no split {name!r}", where="--split", todo=f"use one of: {', '.join(list_names())}"
+            f"there is no split {name!r}",
+            where="--split",
+            todo=f"use one of: {', '.join(list_names())}",
+            topic="which-views",
         )
     text = (_FOLDER / f"{name}.csv").read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if not line.startswith("#")]
@@ -77,6 +80,7 @@ def choose_named(root: Path, names: Sequence[str], request: Request) -> Split:
             "--split and a list of views are given",
             where=f"--split {request.split}",
             todo="leave out --split, or --train-list and --test-list",
+            topic="which-views",
         )
     row = _find_row(name, _find_scene(rows, scene, root, request), request.views, rows)
     _check_fit(row, names, root, name)
@@ -100,6 +104,7 @@ def _find_scene(rows: Sequence[Row], scene: str, root: Path, request: Request) -
             todo=f"name it with --split {request.split}:SCENE, SCENE one of {', '.join(known)}"
             if not scene
             else f"use one of {', '.join(known)}",
+            topic="which-views",
         )
     return found[0]
 
@@ -113,6 +118,7 @@ def _find_row(name: str, scene: str, views: int | None, rows: Sequence[Row]) -> 
             f"the split has no {wanted} training views of {scene}",
             where=f"--split {name}",
             todo=f"pass --views with one of {listed}",
+            topic="which-views",
         )
     return of_scene[wanted]
 
@@ -137,6 +143,7 @@ def _check_fit(row: Row, names: Sequence[str], root: Path, split: str) -> None:
             where=root,
             cause=f"another scene than {row.dataset}'s {row.scene}, or a model with fewer photographs",
             todo="use the published data, or list views by hand with --train-list and --test-list",
+            topic="which-views",
         )
 
 

@@ -109,4 +109,5 @@ def _refuse_size(size: tuple[int, int], full: tuple[int, int], factor: float, pa
         todo="turn it back by a quarter, or put the images there that the model was made from"
         if sideways
         else "put the images there that the model was made from; smaller copies go to images_<F>",
+        topic="photograph-size",
     )

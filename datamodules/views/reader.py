@@ -194,7 +194,11 @@ def map_on_cores(function: Callable[[int], _T], positions: Sequence[int]) -> lis
         if alike:
             others = "another view" if alike == 1 else f"{alike} other views"
             raise SceneError(
-                f"{first.what}; the same of {others}", where=first.where, cause=first.cause, todo=first.todo
+                f"{first.what}; the same of {others}",
+                where=first.where,
+                cause=first.cause,
+                todo=first.todo,
+                topic=first.topic,
             )
         raise first
     return [result for result in results if not isinstance(result, SceneError)]

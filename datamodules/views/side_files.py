@@ -97,6 +97,7 @@ def read_depth(
             f"the depth map is {size[0]} x {size[1]}, another shape than its image's {full[0]} x {full[1]}",
             where=path,
             todo="make the depth map from the image, or remove it",
+            topic="depth",
         )
     depth = images.decode_depth(data, path) if decoded is None else decoded
     return torch.from_numpy(images.shrink_nearest(depth, *target))
@@ -117,6 +118,7 @@ def refuse_unmasked(reading: Reading, file: Frame, photo: Photograph) -> None:
             where=photo.path,
             cause="mask_path has nerfstudio's meaning here",
             todo="pass --mask-path foreground if these files are white on the object",
+            topic="mask-missing",
         )
     source, folder = reading.request.mask_source, reading.request.masks or reading.mask_folder
     lacks, missing = [], folder is not None and not (reading.root / folder).is_dir()
@@ -133,6 +135,7 @@ def refuse_unmasked(reading: Reading, file: Frame, photo: Photograph) -> None:
             where=photo.path,
             cause=f"masks among the photographs: {printable(beside.name)} is one by its name",
             todo=f"move such files to {folder or 'masks'}/",
+            topic="mask-missing",
         )
     raise SceneError(
         f"the photograph {printable(file.name)} has no foreground mask: {', and '.join(lacks)}",
@@ -141,6 +144,7 @@ def refuse_unmasked(reading: Reading, file: Frame, photo: Photograph) -> None:
         todo=f"pass --masks {others[0]} if its files are white (or opaque) on the object"
         if others
         else NO_MASKS,
+        topic="mask-missing",
     )
 
 
@@ -208,6 +212,7 @@ def open_side_file(reading: Reading, relative: str, photo: Photograph, what: str
         if sideways
         else f"make the {what} from the image, at any size of the same shape; where the image was undistorted, "
         "the same way",
+        topic="size",
     )
 
 

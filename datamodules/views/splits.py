@@ -101,6 +101,7 @@ def choose(
                 "sparse_test.txt is missing",
                 where=root,
                 todo="write the zero-based positions of the views to test on into it, one per line",
+                topic="which-views",
             )
         held, hashes[test_where] = _read(root, test_where, count, request.allow_outside)
     listed = held is not None
@@ -151,6 +152,7 @@ def _pick_training(
             f"{wanted} training views are wanted, but {len(pool)} of the {len(names)} views are for training",
             where=root,
             todo=todo,
+            topic="which-views",
         )
     train = pick_evenly(pool, wanted)
     log.info(
@@ -171,6 +173,7 @@ def _refuse_shared(train: list[int], tested: list[int], where: str, root: Path) 
             where=f"{root}: {where}",
             cause="a test on views that were trained on measures nothing",
             todo=f"take them out of {where.split(' and ')[1]}",
+            topic="which-views",
         )
 
 
@@ -189,6 +192,7 @@ def _no_index_file(root: Path, views: int | None, available: list[int], by_hand:
         todo=f"pass --views with one of {listed}{other}"
         if available
         else f"write the zero-based positions of the training views, one per line, into sparse_<N>.txt{other}",
+        topic="which-views",
     )
 
 
@@ -209,6 +213,7 @@ def _check_length(root: Path, name: str, train: list[int], views: int) -> None:
             f"{name} lists {len(train)} views, its name says {views}",
             where=root / name,
             todo="rename the file or correct the list",
+            topic="which-views",
         )
 
 
@@ -231,10 +236,13 @@ def parse_positions(data: bytes, count: int, path: Path) -> list[int]:
                 f"{name} holds {word[:40]!r}, which is not an integer",
                 where=path,
                 todo="write zero-based positions in the name-sorted list of images, not file names",
+                topic="which-views",
             )
     positions = [int(word) for word in words]
     if not positions:
-        raise SceneError(f"{name} lists no views", where=path, todo="write one position per line")
+        raise SceneError(
+            f"{name} lists no views", where=path, todo="write one position per line", topic="which-views"
+        )
     outside = [p for p in positions if not 0 <= p < count]
     if outside:
         raise SceneError(
@@ -242,10 +250,16 @@ def parse_positions(data: bytes, count: int, path: Path) -> list[int]:
             where=path,
             cause="positions counted from 1, or a list made for another model" if outside[0] >= 0 else None,
             todo="write zero-based positions in the name-sorted list of registered images",
+            topic="which-views",
         )
     seen: set[int] = set()
     for p in positions:
         if p in seen:
-            raise SceneError(f"{name} lists position {p} twice", where=path, todo="list each view once")
+            raise SceneError(
+                f"{name} lists position {p} twice",
+                where=path,
+                todo="list each view once",
+                topic="which-views",
+            )
         seen.add(p)
     return positions

@@ -48,12 +48,15 @@ def read_list(text: str, names: Sequence[str], where: str) -> list[int]:
                 where=place,
                 cause=None if content is not None or "," in text else "there is no such file either",
                 todo=f"list positions from 0 to {len(names) - 1} or names such as {names[0]}, with commas between",
+                topic="which-views",
             )
         if named is not None and numbered is not None and named != numbered:
             _refuse_two(word, names[named], names[numbered], numbered, place)
         positions.append(position)
     if not positions or len(set(positions)) < len(positions):
-        raise ConfigError(f"{where} lists {'a view twice' if positions else 'no views'}", where=place)
+        raise ConfigError(
+            f"{where} lists {'a view twice' if positions else 'no views'}", where=place, topic="which-views"
+        )
     return positions
 
 
@@ -124,4 +127,5 @@ def _refuse_two(word: str, named: str, numbered: str, position: int, place: str)
         todo=todo
         if named == word
         else f"write {named} for the first and {numbered} for the second; or {todo}",
+        topic="which-views",
     )

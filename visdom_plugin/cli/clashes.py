@@ -64,7 +64,9 @@ def refuse_clashes(words: Sequence[str]) -> None:
         if clash.option in given and beside:
             named = " ".join([clash.other, *values[:1]]) if clash.values else clash.other
             raise ConfigError(
-                f"{clash.option} and {named} contradict each other: {clash.why}", todo="leave one of them out"
+                f"{clash.option} and {named} contradict each other: {clash.why}",
+                todo="leave one of them out",
+                topic="contradiction",
             )
     _refuse_two_numbers(given)
     _refuse_two_spellings(words)
@@ -78,7 +80,9 @@ def refuse_unread(words: Sequence[str], needs: Sequence[_Need]) -> None:
         read = values & set(need.values) if need.values else need.other in given
         if need.option in given and not read:
             raise ConfigError(
-                f"{need.option} says nothing without {wanted}", todo=f"add {wanted}, or leave it out"
+                f"{need.option} says nothing without {wanted}",
+                todo=f"add {wanted}, or leave it out",
+                topic="contradiction",
             )
 
 
@@ -112,6 +116,7 @@ def _refuse_two_numbers(given: dict[str, list[str]]) -> None:
         f"--views {views[0]} and --train-list{listed} both say which views train",
         where=f"--train-list {lists[0][:200]}",
         todo="leave out --views, as the list says how many, or --train-list",
+        topic="contradiction",
     )
 
 
@@ -120,4 +125,6 @@ def _refuse_two_spellings(words: Sequence[str]) -> None:
     names = [word.partition("=")[0] for word in words]
     spelled = [name for name in ("-k", "--k", f"{_HULL}k") if name in names]
     if len(spelled) > 1:
-        raise ConfigError(f"K is given twice: {' and '.join(spelled)}", todo="leave one of them out")
+        raise ConfigError(
+            f"K is given twice: {' and '.join(spelled)}", todo="leave one of them out", topic="contradiction"
+        )

@@ -11,7 +11,7 @@ from importlib.metadata import version
 from visdom_plugin.cli.clashes import refuse_clashes
 from visdom_plugin.cli.early import read_early
 from visdom_plugin.compute.openmp import wait_briefly
-from visdom_plugin.errors import ConfigError, VisDomError
+from visdom_plugin.errors import ConfigError, VisDomError, say_more
 from visdom_plugin.hull.wording import for_commands
 
 USER_ERROR, INTERRUPTED = 2, 130
@@ -50,7 +50,7 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
         with for_commands():
             return command(words) or 0
     except VisDomError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {error}\n{say_more(error.topic)}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt as stop:
         # By name, because importing the class would import torch.
@@ -68,7 +68,8 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
             print(BUG, file=sys.stderr)
             raise
         print(
-            f"error: {error}\n  what to do: free disk space or choose another location, then repeat the command",
+            f"error: {error}\n  what to do: free disk space or choose another location, then repeat the command\n"
+            f"{say_more('disk')}",
             file=sys.stderr,
         )
         return USER_ERROR

@@ -129,6 +129,7 @@ def splat_transform(source: Path, target: Path, *, asked: Path) -> None:
             f"a {asked.suffix} file is made by splat-transform, which needs Node.js, and there is none",
             where=asked,
             todo=f"install Node.js 18 or later; or export a .ply and run, where there is one: {line}",
+            topic="not-installed",
         )
     done = subprocess.run(
         [*words, "-q", "-w", "-g", "cpu", source, target], capture_output=True, text=True, check=False

@@ -71,11 +71,13 @@ class Cameras:
             raise SceneError(
                 f"unknown camera convention {convention!r}",
                 todo='say convention="opencv" (y down, z forward) or convention="opengl" (y up, z backward)',
+                topic="poses",
             )
         if intrinsics.shape[-2:] != (3, 3) or motion.shape[-2:] not in ((4, 4), (3, 4)):
             raise SceneError(
                 f"camera matrices have shapes {tuple(intrinsics.shape)} and {tuple(motion.shape)}",
                 todo="pass K as (..., 3, 3) and world_from_camera as (..., 4, 4) or (..., 3, 4)",
+                topic="poses",
             )
         if motion.shape[-2] == 3:
             last = motion.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*motion.shape[:-2], 1, 4)
@@ -89,6 +91,7 @@ class Cameras:
                 f"the intrinsics are for cameras of shape {tuple(intrinsics.shape[:-2])}, "
                 f"world_from_camera for {tuple(motion.shape[:-2])}",
                 todo="pass intrinsics (N, 3, 3), one per camera, or (3, 3) for all",
+                topic="poses",
             ) from error
         size = _sizes(batch, motion.device, width=width, height=height)
         cameras = cls(intrinsics.expand(*batch, 3, 3), motion.expand(*batch, 4, 4), *size)
@@ -222,6 +225,7 @@ def _check(cameras: Cameras) -> None:
                 f"{name} of {_which(bad)} holds NaN or infinite numbers",
                 cause="the pose estimation failed for this view",
                 todo="drop the view or estimate its pose again",
+                topic="poses",
             )
     rotation = cameras.world_from_camera[..., :3, :3]
     off = (rotation.mT @ rotation - torch.eye(3).to(rotation)).abs().amax((-2, -1))
@@ -231,6 +235,7 @@ def _check(cameras: Cameras) -> None:
             f"the upper left 3 x 3 block of world_from_camera of {_which(bad)} is not a rotation",
             cause="a scaled or mirrored pose, or a matrix in row-major order taken for column-major",
             todo="remove scale and reflection; pass camera-to-world matrices",
+            topic="poses",
         )
     last = cameras.world_from_camera[..., 3, :]
     bad = ((last - last.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() > 1e-6).any(-1)
@@ -239,6 +244,7 @@ def _check(cameras: Cameras) -> None:
             f"the last row of world_from_camera of {_which(bad)} is {_row(last, bad)}, not (0, 0, 0, 1)",
             cause="a transposed matrix, whose position stands in its last row, or a scaled one",
             todo="pass matrices that map columns, [R t; 0 0 0 1]: transpose them back",
+            topic="poses",
         )
     K = cameras.intrinsics
     form = "pass [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
@@ -249,11 +255,14 @@ def _check(cameras: Cameras) -> None:
             f"the last row of the intrinsics of {_which(bad)} is {_row(last, bad)}, not (0, 0, 1)",
             cause="a transposed matrix, or one that is scaled or has the axes of another convention",
             todo=form,
+            topic="poses",
         )
     skew = torch.maximum(K[..., 0, 1].abs(), K[..., 1, 0].abs())
     bad = (K[..., 0, 0] <= 0) | (K[..., 1, 1] <= 0) | (skew > 1e-6 * K[..., 0, 0].abs())
     if bad.any():
-        raise SceneError(f"intrinsics of {_which(bad)} need positive focal lengths and no skew", todo=form)
+        raise SceneError(
+            f"intrinsics of {_which(bad)} need positive focal lengths and no skew", todo=form, topic="poses"
+        )
     bad = (cameras.width <= 0) | (cameras.height <= 0)
     if bad.any():
         raise SceneError(f"width and height of {_which(bad)} must be positive")
@@ -279,7 +288,7 @@ def _check_units(cameras: Cameras) -> None:
         elif fx <= min(180, w):
             todo += f"; and where {fx:.4g} is an angle in degrees, fx = width / (2 tan(angle / 2)), fy alike"
     values = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} for an image of {w:g} x {h:g}"
-    raise SceneError(f"K of {_which(bad)} is not in pixels: {values}", cause=cause, todo=todo)
+    raise SceneError(f"K of {_which(bad)} is not in pixels: {values}", cause=cause, todo=todo, topic="scale")
 
 
 def _row(rows: Tensor, bad: Tensor) -> str:

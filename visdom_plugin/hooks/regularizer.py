@@ -80,6 +80,7 @@ def _opacity(drawn: Opacity | Tensor, shape: torch.Size) -> Tensor:
             where="VisDomGaussianRegularizer.loss",
             cause="a renderer that returns several things: gsplat's returns colours, opacity, info",
             todo="return the opacity tensor alone, or an object that has it as .alpha",
+            topic="render",
         )
     # An empty picture may be a constant.
     if torch.is_grad_enabled() and not alpha.requires_grad and bool((alpha > 0).any()):
@@ -88,6 +89,7 @@ def _opacity(drawn: Opacity | Tensor, shape: torch.Size) -> Tensor:
             where="VisDomGaussianRegularizer.loss",
             cause="a render under torch.no_grad(), a detached opacity, or Gaussians that are not trained",
             todo="render with gradients; to look at the loss alone, call it under torch.no_grad(), too",
+            topic="render",
         )
     kept = [d for d in alpha.shape if d != 1]
     if kept != [d for d in shape if d != 1]:
@@ -96,6 +98,7 @@ def _opacity(drawn: Opacity | Tensor, shape: torch.Size) -> Tensor:
             where="VisDomGaussianRegularizer.loss",
             cause="a renderer that ignores the camera's width and height, or returns colours",
             todo="return opacity (H, W) of the size that camera.height and camera.width say",
+            topic="render",
         )
     return alpha if alpha.shape == shape else alpha.reshape(shape)
 
@@ -112,6 +115,7 @@ def _check_frame(hull: Hull, cameras: Cameras) -> None:
             where="VisDomGaussianRegularizer",
             cause="a hull in another frame than the cameras': one of the two was moved, scaled or turned",
             todo="carve from the poses that the trainer trains with",
+            topic="render",
         )
 
 

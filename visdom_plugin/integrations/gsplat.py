@@ -221,6 +221,9 @@ def _gsplat() -> ModuleType:
         import gsplat.strategy.ops
     except ImportError as error:
         raise PluginError(
-            "this needs gsplat, which cannot be imported", cause=str(error), todo="pip install gsplat"
+            "this needs gsplat, which cannot be imported",
+            cause=str(error),
+            todo="pip install gsplat",
+            topic="not-installed",
         ) from error
     return gsplat

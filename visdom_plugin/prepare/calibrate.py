@@ -83,6 +83,7 @@ def calibrate(
             where=", ".join(names[:3]),
             cause="the object covers the board, or the photographs are blurred or from too flat an angle",
             todo=f"show at least {LEAST_CORNERS} corners in each photograph, the whole board if possible",
+            topic="no-board",
         )
     scale = max(sizes[0])
     solver = _Solver([corners[i] for i in used], points, [sizes[i] for i in used])
@@ -108,6 +109,7 @@ def calibrate(
                 where=", ".join(names[:3]),
                 cause="all look straight down on the board, or show little of it, and the files have no EXIF data",
                 todo="add photographs from lower down, or give the focal length with --focal-35mm",
+                topic="focal-length",
             )
         notes.append(
             f"the focal length is not determined by the views ({math.exp(state[0]):.0f} px +- {sigma[0]:.0%}) and "

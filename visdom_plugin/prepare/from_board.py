@@ -103,4 +103,5 @@ def _refuse(photographs: Sequence[Photograph], found: Sequence[Corners], setting
         where=f"{photographs[0].path.parent}: {list_some(p.name for p in photographs)}",
         cause=cause,
         todo=todo,
+        topic="no-board",
     )

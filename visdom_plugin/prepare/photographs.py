@@ -73,13 +73,16 @@ def find_photographs(folder: Path) -> tuple[list[Photograph], list[str]]:
                 f"it holds raw photographs: {list_some(raw, 3)}",
                 "develop them to JPEG, TIFF or PNG",
             )
-        raise SceneError("there are no photographs in this folder", where=base, cause=cause, todo=todo)
+        raise SceneError(
+            "there are no photographs in this folder", where=base, cause=cause, todo=todo, topic="no-scene"
+        )
     if len(files) > _MOST:
         raise SceneError(
             f"there are {len(files)} photographs; {_MOST} at most are read",
             where=base,
             cause="the frames of a video",
             todo="choose 6 to 50 of them, from different directions",
+            topic="photograph",
         )
     _refuse_clashes(files, base)
     notes = [f"not read: {list_some(group)}, which {what}" for group, what in (
@@ -108,6 +111,7 @@ def _refuse_clashes(files: Sequence[Path], base: Path) -> None:
             where=base,
             cause="one photograph in two formats, as cameras save them, or masks beside the photographs",
             todo="keep one file of each; masks go to a folder masks",
+            topic="photograph",
         )
 
 
@@ -170,4 +174,5 @@ def require_one_camera(photographs: Sequence[Photograph]) -> None:
             where=photographs[0].path.parent,
             cause="two phones, another lens of the phone (0.5x, 2x), a crop or a zoom",
             todo="keep those of one camera at one zoom, as taken; the board calibrates them together",
+            topic="several-lenses",
         )

@@ -51,6 +51,7 @@ def find_earlier(out: Path, asked: dict[str, Any], overwrite: bool) -> list[str]
             "there is a folder or file of this name, and it is no scene of visdom-prepare",
             where=f"--out {out}",
             todo="name a new folder",
+            topic="other-run",
         )
     if overwrite:
         return None
@@ -60,6 +61,7 @@ def find_earlier(out: Path, asked: dict[str, Any], overwrite: bool) -> list[str]
             f"this folder holds a scene made of other photographs or settings ({', '.join(differs) or 'version'})",
             where=f"--out {out}",
             todo="name another folder, or pass --overwrite to make this one anew",
+            topic="other-run",
         )
     written: dict[str, str] = record.get("written", {})
     return [n for n, digest in written.items() if not (out / n).is_file() or hash_file(out / n) != digest]

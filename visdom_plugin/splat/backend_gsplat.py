@@ -22,6 +22,7 @@ def rasterise_gsplat(
             "drawing Gaussians on CUDA needs gsplat, which cannot be imported",
             cause=str(error),
             todo='pip install "visdom-plugin[cuda]", or use --device cpu',
+            topic="not-installed",
         ) from error
     means = gaussians.means
     width, height = camera.size

@@ -122,6 +122,7 @@ class TensorBoard:
                 "TensorBoard's files need the package tensorboard, which is not installed",
                 where="--tensorboard",
                 todo="pip install 'visdom-plugin[tensorboard]', or leave --tensorboard out",
+                topic="not-installed",
             ) from error
         self.folder, self._make = folder, SummaryWriter
         self._writer: SummaryWriter | None = None

@@ -58,6 +58,7 @@ def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> S
             f"{len(absent)} views have no mask: {list_some(absent)}",
             where=scene.name,
             todo="make masks for them, or pass --data.missing-masks colour|hull",
+            topic="mask-missing",
         )
     if unmeasured:
         log.warning(
@@ -78,6 +79,7 @@ def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> S
             where=scene.name,
             cause=f"and only {given} training views have one: a hull needs two",
             todo="make masks for them" if given else NO_MASKS,
+            topic="mask-missing",
         )
     domain = VisibleDomain(k=min(3, given)) if domain is None else domain
     outlines = outline_views(domain.carve(*scene.train.silhouettes()), scene.train, missing)

@@ -56,6 +56,7 @@ class Viewer:
             raise PluginError(
                 "the viewer needs viser, which is not installed",
                 todo="pip install 'visdom-plugin[viewer]'",
+                topic="not-installed",
             ) from error
         self.subject = subject
         cameras = subject.scene.train.cameras

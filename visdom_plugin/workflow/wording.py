@@ -29,7 +29,7 @@ def for_callers(function: Callable[P, T]) -> Callable[P, T]:
             if said == list(parts):
                 raise
             what, where, cause, todo = said
-            raise type(error)(what or "", where=where, cause=cause, todo=todo) from error
+            raise type(error)(what or "", where=where, cause=cause, todo=todo, topic=error.topic) from error
 
     return spoken
 

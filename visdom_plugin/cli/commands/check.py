@@ -16,7 +16,7 @@ import tyro
 from datamodules.built_in import on_disk
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
-from visdom_plugin.errors import ConfigError, SceneError, list_some
+from visdom_plugin.errors import PAGE, ConfigError, SceneError, list_some
 
 if TYPE_CHECKING:
     from visdom_plugin.hull.checks.check import Check
@@ -139,7 +139,9 @@ def warn_of_faults(scene: Scene, *, inverted: bool = False) -> None:
     for f in check_views(views, masks, brief=True, layout=scene.source.get("layout")).findings:
         todo = _advise(f, len(views), inverted)
         if f.kind == "inverted" and f.sure == "certain":
-            raise SceneError(f.what, where=scene.name, cause="masks that are black on the object", todo=todo)
+            raise SceneError(
+                f.what, where=scene.name, cause="masks that are black on the object", todo=todo, topic=f.kind
+            )
         log.warning("%s (%s); what to do: %s; `visdom-check` tells more", f.what, f.sure, todo)
 
 
@@ -221,7 +223,7 @@ def _is_about_a_mask(error: SceneError, folder: Path) -> bool:
 
 
 def _unreadable(error: SceneError) -> dict[str, Any]:
-    kind = "empty" if "empty" in error.what else "size" if " x " in error.what else "mask"
+    kind = error.topic if error.topic in ("empty", "size") else "mask"
     what = error.what + (f" ({error.cause})" if error.cause else "")
     return {
         "kind": kind,
@@ -261,6 +263,7 @@ def _table(report: dict[str, Any]) -> None:
                 f["kind"], f"[{colours[sure]}]{sure}[/]", escape(list_some(f["views"], 3)) or "all", text
             )
         console.print(table)
+        console.print(f"more on each: {PAGE}#findings", soft_wrap=True)
     for line in summarise_fit(report):
         console.print(escape(line))
     if "out" in report:

@@ -81,6 +81,7 @@ def watching(folder: Path) -> Iterator[None]:
             "the viewer needs viser, which is not installed",
             where="--view",
             todo="pip install 'visdom-plugin[viewer]', or leave --view out",
+            topic="not-installed",
         )
     words = [sys.executable, "-m", "visdom_plugin.cli.commands.view", str(folder), "--wait"]
     viewer = subprocess.Popen(words)

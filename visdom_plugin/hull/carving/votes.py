@@ -123,6 +123,7 @@ def gather_silhouettes(
                 f"mask {view} has shape {mask.shape}, its camera's image has {height} rows and {width} columns",
                 where=f"view {view}",
                 todo="resize the masks to the images, or pass cameras.resized(...)",
+                topic="size",
             )
         if mask.dtype != np.bool_ and not np.isin(mask, (0, 1)).all():
             raise SceneError(

@@ -86,7 +86,7 @@ def explain_one_point(settings: HullSettings, cameras: Cameras, silhouettes: Sil
     fault = next(f for f in _faults(settings, cameras, silhouettes) if f.kind in ("axes", "centres"))
     what = f"all {len(cameras)} cameras stand at one point, from which nothing can be told of depth"
     cause = None if fault.kind == "centres" else _cause(fault)
-    return SceneError(what, where=_where(fault), cause=cause, todo=_todo(fault))
+    return SceneError(what, where=_where(fault), cause=cause, todo=_todo(fault), topic=fault.kind)
 
 
 def refuse_other_unit(cameras: Cameras, silhouettes: Silhouettes) -> None:
@@ -94,7 +94,7 @@ def refuse_other_unit(cameras: Cameras, silhouettes: Silhouettes) -> None:
     decide, a warning tells of those that are odd."""
     outlines = draw_outlines(cameras, silhouettes)
     if found := find_other_unit(cameras, outlines)[0]:
-        raise SceneError(_cause(found[0]), where="camera intrinsics", todo=found[0].todo)
+        raise SceneError(_cause(found[0]), where="camera intrinsics", todo=found[0].todo, topic=found[0].kind)
     if found := find_other_unit(cameras, outlines, faint=True)[0]:
         log.warning("camera intrinsics: %s; %s", _cause(found[0]), found[0].todo)
         return
@@ -119,7 +119,7 @@ def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouett
     log.info("the hull covers %.0f%% of the masks; looking for a cause", 100 * covered)
     fault = next(iter(_faults(settings, cameras, silhouettes)), None)
     if fault is not None and fault.kind == "axes" and fault.sure != "possible":
-        raise SceneError(what, where=_where(fault), cause=_cause(fault), todo=_todo(fault))
+        raise SceneError(what, where=_where(fault), cause=_cause(fault), todo=_todo(fault), topic=fault.kind)
     if speck is not None:
         meeting = "poses or intrinsics that do not belong to these masks, so that views meet only by chance"
         raise SceneError(
@@ -127,6 +127,7 @@ def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouett
             where="camera poses" if fault is None else _where(fault),
             cause=meeting if fault is None else _cause(fault),
             todo=wording().look if fault is None else _todo(fault),
+            topic="disagreement" if fault is None else fault.kind,
         )
     if covered >= POOR_COVERAGE:
         return None

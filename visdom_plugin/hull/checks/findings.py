@@ -8,14 +8,18 @@ from typing import Literal, NamedTuple
 from visdom_plugin.errors import list_some
 
 Sure = Literal["certain", "likely", "possible"]
+KINDS = (
+    "size", "empty", "full", "border", "speckled", "inverted", "duplicate", "axes", "order", "turned", "swapped",
+    "scale", "principal", "centres", "view", "disagreement", "clustered", "covisibility", "few",
+)  # fmt: skip
+"""What findings are called; each is an anchor of `visdom_plugin.errors.PAGE`."""
 
 
 class Finding(NamedTuple):
     """One thing that is wrong, or worth knowing."""
 
     kind: str
-    """Machine-readable name: size, empty, full, border, speckled, inverted, duplicate, axes, order, turned,
-    swapped, scale, principal, centres, view, disagreement, clustered, covisibility, few."""
+    """Machine-readable name, one of `KINDS`."""
     what: str
     """A sentence with the number behind it."""
     views: tuple[int, ...]

@@ -84,6 +84,7 @@ def known_views(metadata: dict[str, object] | None, method: str) -> TrainingView
         raise ConfigError(
             f"{method} needs foreground masks, and this data parser hands on none",
             todo=f"use ours: ns-train {method} visdom --data DIR",
+            topic="mask-missing",
         )
     return known
 
@@ -99,6 +100,7 @@ def rgba_mask_loss(accumulation: Tensor, image: Tensor) -> Tensor:
             "the mask loss needs masks, and these photographs come without",
             where="--pipeline.model.mask-weight",
             todo="pass `visdom --background alpha`, or set the weight to 0",
+            topic="mask-missing",
         )
     # Nerfstudio trains in mixed precision, where torch refuses this loss.
     with torch.autocast(accumulation.device.type, enabled=False):

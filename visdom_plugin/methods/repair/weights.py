@@ -81,6 +81,7 @@ def check(config: WeightsConfig, image_size: int) -> NetworkFiles:
             f"GaussianObject's repair needs {', '.join(missing)}, not installed here",
             where="the extra [diffusion]",
             todo="pip install 'visdom-plugin[diffusion]'; method:3dgs-go, its coarse stage, does without",
+            topic="not-installed",
         )
     files = find_files(config)
     halvings = sum(len(files.config(part)["block_out_channels"]) - 1 for part in ("vae", "unet"))
@@ -109,6 +110,7 @@ def find_files(config: WeightsConfig) -> NetworkFiles:
             where="--method.weights.folder",
             todo=f"name one there or in the environment variable {VARIABLE}; to fill it, on a machine with a "
             f"network: {'; '.join(_download(name) for name in unnamed)}",
+            topic="weights",
         )
     sd, controlnet = (Path(folders[name] or "").expanduser() for name in (SD, CONTROLNET))
     parts = {name: sd / name for name in ("unet", "vae", "text_encoder", "tokenizer", "scheduler")}
@@ -145,6 +147,7 @@ def _demand(path: Path, there: bool, kind: str, source: str) -> None:
             where=path,
             cause="a folder of another layout than diffusers', or a download that was cut short",
             todo=f"on a machine with a network: {_download(source)}",
+            topic="weights",
         )
 
 

@@ -48,6 +48,7 @@ def choose_masks(
             f"{len(missing)} of {len(given)} photographs have no mask: {list_some(names[i] for i in missing)}",
             where=where,
             todo=NO_MASKS,
+            topic="mask-missing",
         )
     if settings.source == "rembg":
         from visdom_plugin.prepare.masks.rembg import cut_with_rembg
@@ -74,6 +75,7 @@ def choose_masks(
             if way == "grabcut"
             else "the network sees nothing there that stands out",
             todo="say where it is: --box, or --height; leave the photographs out; or give masks: --masks DIR",
+            topic="no-object",
         )
     kept = [made[i] if mask is None else mask for i, mask in enumerate(given)]
     return list(kept), [way if mask is None else "given" for mask in given]
@@ -90,4 +92,5 @@ def _find_box(settings: MaskSettings, board: BoardSettings | None, where: Path) 
         cause="poses of another program know no object",
         todo="give masks (--masks DIR), a box in scene units (--box X0 Y0 Z0 X1 Y1 Z1), or networks "
         "(--mask-source rembg); or leave masks to later: --mask-source none",
+        topic="mask-missing",
     )

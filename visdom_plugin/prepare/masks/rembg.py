@@ -38,6 +38,7 @@ def open_session(models: str | None, model: str) -> tuple[Any, Any]:
             "rembg needs the folder that its models are in",
             where="--mask-source rembg",
             todo=f"--rembg-models DIR, with {model}.onnx from rembg's release page in it",
+            topic="weights",
         )
     folder = Path(models).expanduser()
     files = sorted(p.stem for p in folder.glob("*.onnx")) if folder.is_dir() else []
@@ -46,6 +47,7 @@ def open_session(models: str | None, model: str) -> tuple[Any, Any]:
             f"there is no {model}.onnx in this folder" + (f"; there is {list_some(files)}" if files else ""),
             where=f"--rembg-models {models}",
             todo=f"--rembg-model {files[0]}" if files else "download the model from rembg's release page",
+            topic="weights",
         )
     # Read by rembg when a session is opened: where models lie, and that one of another checksum than that of the
     # release is not to be downloaded in its place.
@@ -57,6 +59,7 @@ def open_session(models: str | None, model: str) -> tuple[Any, Any]:
             "rembg is not installed",
             where="--mask-source rembg",
             todo="pip install 'visdom-plugin[rembg]', or take --mask-source grabcut",
+            topic="not-installed",
         ) from error
     try:
         return new_session(model), remove

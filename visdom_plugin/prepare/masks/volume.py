@@ -65,6 +65,7 @@ def outline_of_box(cameras: Cameras, box: np.ndarray, names: list[str]) -> list[
                 where=f"{box[0].round(4).tolist()} to {box[1].round(4).tolist()}",
                 cause="the object is elsewhere in the scene, or this view's pose is wrong",
                 todo="say where it is: --box X0 Y0 Z0 X1 Y1 Z1, in scene units",
+                topic="no-object",
             )
         found.append(mask.astype(bool))
     return found

@@ -40,6 +40,7 @@ def place_by_colmap(photographs: Sequence[Photograph]) -> Placed:
             "pycolmap is not installed",
             where="--colmap",
             todo="pip install 'visdom-plugin[colmap]', or run COLMAP yourself and pass --poses MODEL",
+            topic="not-installed",
         ) from error
     require_one_camera(photographs)
     few = len(photographs) < USUAL_VIEWS

@@ -40,6 +40,7 @@ def place_by_file(path: Path, photographs: Sequence[Photograph]) -> Placed:
             todo=f"one of what lies there: {list_some(there)}"
             if there
             else f"--poses board, or one of {_KNOWN}",
+            topic="no-scene",
         )
     found = _read_folder(path, photographs) if path.is_dir() else _read_file(path, photographs)
     if isinstance(found, Capture):
@@ -103,6 +104,7 @@ def _unknown(path: Path) -> SceneError:
         where=f"--poses {path}",
         cause="a project file in place of an export, or the folder above or below",
         todo=f"export one of: {_KNOWN}",
+        topic="layout",
     )
 
 

@@ -85,6 +85,7 @@ def _pair(
                 where=where,
                 cause="photographs were added or left out after the poses were estimated",
                 todo="put exactly the photographs into the folder that the poses were estimated from",
+                topic="unmatched-poses",
             )
         note = f"{where.name} names no photographs: its cameras go to them in the order of their names"
         return [(i, i) for i in range(len(photographs))], [note]
@@ -98,6 +99,7 @@ def _pair(
             where=where,
             cause="photographs in several folders under one name, or two models in one file",
             todo="rename the photographs so that each name occurs once, and export again",
+            topic="unmatched-poses",
         )
     pairs = [(i, by_key[_key(p.name)][0]) for i, p in enumerate(photographs) if _key(p.name) in by_key]
     if len(pairs) < 2:
@@ -107,6 +109,7 @@ def _pair(
             where=where,
             cause="the poses are of other photographs, or these were renamed",
             todo="name the photographs as in that file, and have two at least",
+            topic="unmatched-poses",
         )
     used = {j for _, j in pairs}
     spare = [name for j, name in enumerate(listed.names) if j not in used]
@@ -132,4 +135,5 @@ def _size(size: tuple[int, int] | None, photograph: Photograph, where: Path) -> 
         where=where,
         cause="the photographs were cropped, undistorted or turned after the poses were estimated, or before",
         todo="use the photographs that the poses were estimated from",
+        topic="photograph-size",
     )

@@ -58,6 +58,7 @@ def read(root: ET.Element, path: Path) -> Listed:
             where=path,
             cause="exported before Workflow > Align Photos, or of another chunk",
             todo="align the photographs in Metashape and export the cameras again",
+            topic="poses",
         )
     notes = [f"{len(loose)} photographs are not aligned in Metashape"] if loose else []
     return Listed("Metashape", names, np.array(K), sizes, np.stack(poses), bent, notes=notes)
@@ -83,7 +84,10 @@ def _lens(sensor: ET.Element, path: Path) -> tuple[list[float], tuple[int, int],
     kind = sensor.get("type", "frame")
     if kind not in ("frame", "fisheye"):
         raise SceneError(
-            f"the sensor {name} is of type {kind}", where=path, todo="use photographs of a frame camera"
+            f"the sensor {name} is of type {kind}",
+            where=path,
+            todo="use photographs of a frame camera",
+            topic="lens",
         )
     resolution = sensor.find("resolution")
     adjusted = [c for c in sensor.iterfind("calibration") if c.get("class", "adjusted") == "adjusted"]
@@ -102,6 +106,7 @@ def _lens(sensor: ET.Element, path: Path) -> tuple[list[float], tuple[int, int],
             f"the sensor {name} has skewed pixels",
             where=path,
             todo="calibrate without B1 and B2 in Metashape",
+            topic="lens",
         )
     K = [focal + term("b1"), focal, size[0] / 2 + term("cx"), size[1] / 2 + term("cy")]
     if kind == "fisheye":
@@ -112,6 +117,7 @@ def _lens(sensor: ET.Element, path: Path) -> tuple[list[float], tuple[int, int],
             f"the sensor {name} has a K4, which cannot be undistorted here",
             where=path,
             todo="optimise cameras in Metashape without K4, or export undistorted photographs",
+            topic="lens",
         )
     four = (term("k1"), term("k2"), term("p2"), term("p1"))
     if term("k3"):

@@ -129,6 +129,7 @@ def _poses(found: Mapping[str, np.ndarray], path: Path) -> tuple[np.ndarray, str
             f"there are no poses in {path.name}",
             where=path,
             todo=f"save them as {_FROM_WORLD[0]} (camera from world) or {_TO_WORLD[0]} (camera to world)",
+            topic="poses",
         )
     key = from_world or to_world or ""
     raw = np.asarray(found[key], np.float64)
@@ -182,6 +183,7 @@ def _intrinsics(found: Mapping[str, np.ndarray], count: int, copy: _Copy | None,
             where=path,
             cause="only a part of what the network found was saved",
             todo="save intrinsic (N, 3, 3), or focals with images; of pi3 camera_poses and local_points",
+            topic="poses",
         )
     focal = np.broadcast_to(focal, (count,)) if len(focal) == 1 else focal
     if len(focal) != count:
@@ -220,6 +222,7 @@ def _enlarge(focal: np.ndarray, copy: _Copy, size: tuple[int, int], path: Path) 
                 where=path,
                 cause="the arrays of pixels (images) were not saved beside the cameras",
                 todo="save images, too; or export COLMAP's format, which the network's scripts write",
+                topic="poses",
             )
         if copy.padded:
             scale = max(width, height) / copy.width

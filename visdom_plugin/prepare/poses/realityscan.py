@@ -48,6 +48,7 @@ def read_csv(data: bytes, path: Path, photographs: Sequence[Photograph]) -> List
             "the photographs are of different sizes, and this file says none",
             where=path,
             todo="export XMP files (Export > Registration > XMP) beside the photographs, or COLMAP's format",
+            topic="poses",
         )
     names, K, poses, bent = [], [], [], []
     for row in rows:
@@ -88,6 +89,7 @@ def _brown(k: Sequence[float], name: str, path: Path) -> Distortion | None:
             f"{name} has a fourth radial term, which cannot be undistorted here",
             where=path,
             todo="align with the lens model Brown3 or without distortion, or export undistorted photographs",
+            topic="lens",
         )
     bent = Distortion("FULL_OPENCV", (k[0], k[1], k[4], k[5], k[2], 0.0, 0.0, 0.0))
     return None if bent.absent else bent
@@ -116,6 +118,7 @@ def read_xmp(paths: Sequence[Path], photographs: Sequence[Photograph]) -> Listed
                 "the lens model is RealityScan's division, which cannot be undistorted here",
                 where=path,
                 todo="align with the lens model Brown3, or export undistorted photographs",
+                topic="lens",
             )
         names.append(photograph.name)
         K.append([focal, focal, size[0] / 2 + u * longer, size[1] / 2 + v * longer])
@@ -128,6 +131,7 @@ def read_xmp(paths: Sequence[Path], photographs: Sequence[Photograph]) -> Listed
             where=paths[0].parent,
             cause="they are of a camera or an editor, or were exported without camera poses",
             todo="export them with the pose (Export > Registration > XMP), beside the photographs",
+            topic="poses",
         )
     return Listed("RealityScan", names, np.array(K), sizes, np.stack(poses), bent)
 

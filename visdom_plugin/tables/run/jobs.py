@@ -158,7 +158,7 @@ def _resolve(spec: TableSpec, row: Row, workshop: Workshop) -> Resolved | None:
 
 def _within(where: str, error: ConfigError) -> ConfigError:
     inner = "" if error.where is None else f" ({error.where})"
-    return ConfigError(error.what, where=where + inner, cause=error.cause, todo=error.todo)
+    return ConfigError(error.what, where=where + inner, cause=error.cause, todo=error.todo, topic=error.topic)
 
 
 def _place(spec: TableSpec, column: Column) -> str:

@@ -101,13 +101,16 @@ class Slurm(Executor):
             import submitit  # noqa: F401
         except ImportError:
             raise ConfigError(
-                "the executor slurm needs submitit", todo="pip install 'visdom-plugin[slurm]'"
+                "the executor slurm needs submitit",
+                todo="pip install 'visdom-plugin[slurm]'",
+                topic="not-installed",
             ) from None
         missing = [name for name in ("sbatch", "squeue", "srun") if shutil.which(name) is None]
         if missing:
             raise ConfigError(
                 f"the executor slurm needs Slurm's commands; not found: {', '.join(missing)}",
                 todo="run it on a login node of the cluster, or with --executor local",
+                topic="not-installed",
             )
         self.config, self.folder = config, Path(folder).resolve()
         self.pause = min(2.0, config.poll_seconds)

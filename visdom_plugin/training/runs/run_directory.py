@@ -147,6 +147,7 @@ class RunDir:
                 f"the directory holds files that are not a run's: {list_some(foreign, 3)}",
                 where=run.path,
                 todo="choose an empty directory with --out; nothing was changed",
+                topic="other-run",
             )
         try:
             run.path.mkdir(parents=True, exist_ok=True)
@@ -252,6 +253,7 @@ class RunDir:
                 + (f" (process {owner})" if owner else ""),
                 where=self.path,
                 todo="wait for it, stop it, or choose another --out",
+                topic="busy-run",
             ) from None
         lock.truncate(0)
         lock.write(str(os.getpid()))
@@ -292,6 +294,7 @@ class RunDir:
                 "the run directory holds another run (there -> now):\n    " + "\n    ".join(lines[:8]) + more,
                 where=self.path,
                 todo=f"--out {free_name(self.path)} keeps both, --overwrite replaces what is there",
+                topic="other-run",
             )
 
 

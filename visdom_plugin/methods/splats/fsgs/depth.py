@@ -81,12 +81,14 @@ def load_network(target: str) -> Network:
             where=f"--method.depth-network {target}",
             todo="name a function that takes a picture to its disparity, as module:function; code that is not "
             "installed is found where PYTHONPATH points: export PYTHONPATH=FOLDER",
+            topic="depth",
         ) from error
     if not callable(found):
         raise ConfigError(
             f"the depth network is {type(found).__name__}, not a function",
             where=f"--method.depth-network {target}",
             todo="name a function that takes a picture (H, W, 3) to its disparity (H, W)",
+            topic="depth",
         )
     return found
 
@@ -117,6 +119,7 @@ class DepthProvider:
                     f"{list_some(lacking)}",
                     cause="maps that were made for some of the photographs only, or are named otherwise",
                     todo="make the missing ones, or take the folder away to train without depth",
+                    topic="depth",
                 )
             self.training = [of_map(depth.to(device)) for depth in given]
         if not self.training:
@@ -146,4 +149,5 @@ class DepthProvider:
             f"the depth network {what}",
             where=f"--method.depth-network {self.target}",
             todo="return a tensor (H, W) of disparities for a picture (H, W, 3): resize the network's answer",
+            topic="depth",
         )

@@ -1,0 +1,60 @@
+"""Every topic of an error and every kind of a finding has its heading on the page that messages name."""
+
+import ast
+import re
+from pathlib import Path
+
+from tests.docs.test_links import anchors
+from visdom_plugin import errors
+from visdom_plugin.cli.entry import run
+from visdom_plugin.hull.checks.findings import KINDS
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / errors.PAGE
+_TEXT = PAGE.read_text(encoding="utf-8")
+SECTIONS = dict(re.findall(r"^### (\S+)\n(.*?)(?=^#|\Z)", _TEXT, re.M | re.S))
+BESIDE = ("mask", "disk")
+"""What commands say that is neither: a mask that cannot be read, in the check's table, and a full disk."""
+
+
+def used() -> set[str]:
+    """Topics of errors, and kinds of findings, in the source."""
+    found = set()
+    for package in ("visdom_plugin", "datamodules", "method_configs"):
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.keyword) and node.arg == "topic":
+                    found |= {node.value.value} if isinstance(node.value, ast.Constant) else set()
+                if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Finding", "Suspicion"):
+                    found |= {node.args[0].value} if isinstance(node.args[0], ast.Constant) else set()
+    return found
+
+
+def test_every_name_has_a_section_and_every_section_a_name():
+    names = {*errors.TOPICS, *KINDS, *BESIDE}
+    assert set(SECTIONS) == names and names <= anchors(PAGE)
+    assert all(len(text.split()) >= 8 for text in SECTIONS.values())
+
+
+def test_names_in_the_source_are_registered_and_those_registered_are_used():
+    usual = {kind.usual for kind in errors.VisDomError.__subclasses__()}
+    assert used() <= {*errors.TOPICS, *KINDS}
+    assert set(errors.TOPICS) <= used() | usual
+
+
+def test_a_command_ends_its_message_with_the_place_that_tells_more(capsys):
+    def fail(error: Exception):
+        def command(argv):
+            raise error
+
+        assert run(command, []) == 2
+        return capsys.readouterr().err.splitlines()
+
+    assert fail(errors.SceneError("it is empty", todo="mend it", topic="empty")) == [
+        "error: it is empty",
+        "  what to do: mend it",
+        f"  more: {errors.PAGE}#empty",
+    ]
+    assert fail(errors.EmptyHullError("nothing"))[-1] == f"  more: {errors.PAGE}#empty-hull"
+    assert fail(errors.unknown_name("no", "a", ["b"]))[-1] == f"  more: {errors.PAGE}#unknown-name"
+    assert fail(PermissionError(13, "Permission denied"))[-1] == f"  more: {errors.PAGE}#disk"
