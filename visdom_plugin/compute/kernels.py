@@ -35,7 +35,7 @@ _FAST: Any = {
 
 
 def kernel(
-    *, fast: bool = False, error_model: str = "python", inline: str = "never"
+    *, fast: bool = False, error_model: str = "python", inline: str = "never", counted: bool = True
 ) -> Callable[[Function], Function]:
     """Compiles a function at its first call, to run without the GIL, and keeps the machine code on disk.
 
@@ -44,8 +44,10 @@ def kernel(
             infinity, and it is always inlined.
         error_model: "python", where division by zero raises, or "numpy".
         inline: "always" inlines before types are known.
+        counted: False where a function makes no arrays, but takes rows or slices of them in a loop. numba counts
+            who holds an array by an atomic operation for each slice, at which threads wait for one another.
     """
-    options: dict[str, Any] = {"nogil": True, "error_model": error_model, "inline": inline}
+    options: dict[str, Any] = {"nogil": True, "error_model": error_model, "inline": inline, "_nrt": counted}
 
     def compile_later(function: Function) -> Function:
         dispatcher: Any = njit(**options | (_FAST if fast else {}))(function)

@@ -87,6 +87,18 @@ def test_contraction_kernel_equals_torch():
     assert kernel.requires_grad
 
 
+def test_contraction_scales_and_shifts_what_comes_out():
+    points, std = _units(300).float() * 3, torch.rand(300)
+    plain, deviations = contraction.contract(points, std)
+    for gradient in (False, True):  # the kernel, and torch
+        unit, scaled = contraction.contract(
+            points, std.clone().requires_grad_(gradient), scale=0.25, shift=0.5
+        )
+        tolerance = {"rtol": 2e-6, "atol": 1e-7} if gradient else {"rtol": 0, "atol": 0}
+        torch.testing.assert_close(unit, plain * 0.25 + 0.5, **tolerance)
+        torch.testing.assert_close(scaled.detach(), deviations * 0.25, **tolerance)
+
+
 def _frustum_moments(t0, t1, radius):
     """Mean and variance along the axis, and variance across, of a uniformly filled cone between t0 and t1."""
     nodes, weights = np.polynomial.legendre.leggauss(20)

@@ -26,7 +26,7 @@ class Areas(NamedTuple):
         return (self,) if self.known is None else (self, self.known)
 
 
-@kernel()
+@kernel(counted=False)
 def _sum_areas(
     begin: int, end: int, pixels: np.ndarray, sizes: np.ndarray, offsets: np.ndarray,
     table_offsets: np.ndarray, tables: np.ndarray,

@@ -41,7 +41,7 @@ def _bound_pixel(
     return u - half, u + half
 
 
-@kernel()
+@kernel(counted=False)
 def _judge(
     view: int, i0: int, i1: int, j0: int, j1: int, k0: int, k1: int, x: np.ndarray, y: np.ndarray,
     z: np.ndarray, slack: np.ndarray, sizes: np.ndarray, starts: np.ndarray, tables: np.ndarray,
@@ -81,7 +81,7 @@ def _judge(
     return _OPEN
 
 
-@kernel()
+@kernel(counted=False)
 def decide(table: np.ndarray, visible: int, occupied: int, unsettled: int) -> int:
     # A hit never harms; a miss helps K and harms agreement. So the best case is all hits, and in the worst
     # case either all unsettled views miss or none sees the voxel.
@@ -92,7 +92,7 @@ def decide(table: np.ndarray, visible: int, occupied: int, unsettled: int) -> in
     return MIXED
 
 
-@kernel()
+@kernel(counted=False)
 def _classify(
     begin: int, end: int, blocks: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray, slack: np.ndarray,
     sizes: np.ndarray, starts: np.ndarray, tables: np.ndarray, table: np.ndarray, states: np.ndarray,
@@ -136,7 +136,7 @@ def classify_cells(
     return np.where(np.minimum.reduce(said) == DROPPED, DROPPED, np.maximum.reduce(said)).astype(np.uint8)
 
 
-@kernel()
+@kernel(counted=False)
 def _keep_centres(
     begin: int, end: int, cells: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray, sizes: np.ndarray,
     offsets: np.ndarray, pixels: np.ndarray, table: np.ndarray, kept: np.ndarray,

@@ -106,7 +106,7 @@ def _shell(pieces: Pieces, occupancy: np.ndarray, stretch: np.ndarray) -> tuple[
     return runs, starts[np.searchsorted(pieces.labels[order], np.arange(len(pieces.sizes) + 1))]
 
 
-@kernel()
+@kernel(counted=False)
 def _list_shell(
     begin: int, end: int, whole: np.ndarray, coarse: np.ndarray, grid: np.ndarray, starts: np.ndarray,
     runs: np.ndarray,

@@ -36,7 +36,7 @@ def _halves(terms: np.ndarray, view: int, c: int, first: int, step: int) -> tupl
     return 0.5 * (a + b), 0.5 * (d + e), 0.5 * ((b - a) if abs(b - a) >= abs(e - d) else (e - d))
 
 
-@kernel(error_model="numpy")
+@kernel(error_model="numpy", counted=False)
 def _judge_children(
     view: int, row: int, eight: int, i: int, j: int, k: int, step: int, x: np.ndarray, y: np.ndarray,
     z: np.ndarray, slack: np.ndarray, sizes: np.ndarray, starts: np.ndarray, tables: np.ndarray,
@@ -90,7 +90,7 @@ def _judge_children(
         said[row, m] = _EMPTY if total == 0 else mixed
 
 
-@kernel(error_model="numpy")
+@kernel(error_model="numpy", counted=False)
 def _vote_leaf(
     i0: int, j0: int, k0: int, count: int, open_views: np.ndarray, settled: int, per_view: int, x: np.ndarray,
     y: np.ndarray, z: np.ndarray, sizes: np.ndarray, offsets: np.ndarray, pixels: np.ndarray, rule: np.ndarray,

@@ -82,7 +82,7 @@ def _follow_rays(
             rate[j] = np.sqrt(fu * fu + fv * fv)
             if j == i:
                 continue
-            width, height = sizes[j]
+            width, height = sizes[j, 0], sizes[j, 1]
             a, b = _cut(start[j, 2] - near, slope[j, 2], near, far)
             a, b = _cut(start[j, 0], slope[j, 0], a, b)
             a, b = _cut(width * start[j, 2] - start[j, 0], width * slope[j, 2] - slope[j, 0], a, b)
@@ -113,7 +113,7 @@ def _follow_rays(
                     continue
                 u = (start[j, 0] + t * slope[j, 0]) / w
                 v = (start[j, 1] + t * slope[j, 1]) / w
-                width, height = sizes[j]
+                width, height = sizes[j, 0], sizes[j, 1]  # a row of an array would be counted
                 if u < 0 or v < 0 or u >= width or v >= height:
                     continue
                 speed = max(speed, rate[j] / (w * w))

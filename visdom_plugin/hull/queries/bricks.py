@@ -24,7 +24,7 @@ class Bricks(NamedTuple):
     octant i + 2 j + 4 k it goes to smaller x if i, smaller y if j, smaller z if k; it may leave the grid."""
 
 
-@kernel()
+@kernel(counted=False)
 def _pack(begin: int, end: int, grid: np.ndarray, bits: np.ndarray) -> None:
     nx, ny, nz = grid.shape
     for a in range(begin, end):
@@ -36,11 +36,10 @@ def _pack(begin: int, end: int, grid: np.ndarray, bits: np.ndarray) -> None:
                         bits[a, y >> 2, z >> 2] |= np.uint64(1) << np.uint64(base + 16 * (z & 3))
 
 
-@kernel()
-def _look_ahead(begin: int, end: int, bits: np.ndarray, ahead: np.ndarray) -> None:
+@kernel(counted=False)
+def _look_ahead(begin: int, end: int, bits: np.ndarray, outside: np.ndarray, ahead: np.ndarray) -> None:
     """Largest empty cubes by dynamic programming: one more than the smallest of the seven bricks ahead."""
     na, nb, nc = bits.shape
-    outside = np.full(nc, _FARTHEST - 1, np.uint8)
     for octant in range(begin, end):
         i, j, k = 1 - 2 * (octant & 1), 1 - 2 * (octant >> 1 & 1), 1 - 2 * (octant >> 2)
         cubes = ahead[octant]
@@ -67,5 +66,5 @@ def build_bricks(occupancy: np.ndarray) -> Bricks:
     shape = tuple(-(-n // BRICK) for n in occupancy.shape)
     bits, ahead = np.zeros(shape, np.uint64), np.empty((8, *shape), np.uint8)
     parallel_for(_pack, shape[0], 1, occupancy.view(np.uint8), bits)
-    parallel_for(_look_ahead, 8, 1, bits, ahead)
+    parallel_for(_look_ahead, 8, 1, bits, np.full(shape[2], _FARTHEST - 1, np.uint8), ahead)
     return Bricks(bits, ahead)

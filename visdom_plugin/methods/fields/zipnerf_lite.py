@@ -61,8 +61,8 @@ class AntialiasedGrid(nn.Module):
 
     def forward(self, points: Tensor, std: Tensor) -> Tensor:
         """(..., S, 3) points in the local frame and (..., S) standard deviations to (..., outputs)."""
-        contracted, std = contract(points, std)
-        features, weights = encode_mean(contracted * 0.25 + 0.5, std * 0.25, self.table, self.layout)
+        unit, std = contract(points, std, scale=0.25, shift=0.5)
+        features, weights = encode_mean(unit, std, self.table, self.layout)
         magnitude = (INITIAL_FEATURE**2 + mean_square_per_level(self.table.detach(), self.layout)).sqrt()
         return self.net(features, (2 * weights - 1) * magnitude)
 

@@ -13,7 +13,7 @@ POINTS_PER_PIECE = 16384
 BLOCK = 256
 
 
-def contract(points: Tensor, std: Tensor | None = None):
+def contract(points: Tensor, std: Tensor | None = None, *, scale: float = 1.0, shift: float = 0.0):
     """Points outside the unit ball come nearer: x -> (2 - 1/|x|) x/|x|; those inside stay.
 
     A Gaussian's isotropic standard deviation shrinks by the cube root of the Jacobian's determinant, as
@@ -22,16 +22,21 @@ def contract(points: Tensor, std: Tensor | None = None):
     Args:
         points: (..., 3), the object about the unit ball.
         std: (...) standard deviations, or None.
+        scale, shift: what comes out is multiplied by `scale`, and `shift` is then added to the points.
 
     Returns:
-        (..., 3) points of norm < 2, and with `std` also the new (...) standard deviations.
+        (..., 3) points, of norm < 2 before `scale` and `shift`, and with `std` also the new (...) standard
+        deviations.
     """
     constant = not (
         torch.is_grad_enabled() and (points.requires_grad or (std is not None and std.requires_grad))
     )
     if std is not None and constant and points.device.type == "cpu" and points.dtype == torch.float32:
-        return _contract_cpu(points, std)
-    return _contract_torch(points, std)
+        return _contract_cpu(points, std, scale, shift)
+    contracted = _contract_torch(points, std)
+    if std is None:
+        return contracted * scale + shift
+    return contracted[0] * scale + shift, contracted[1] * scale
 
 
 def _contract_torch(points: Tensor, std: Tensor | None):
@@ -43,16 +48,25 @@ def _contract_torch(points: Tensor, std: Tensor | None):
     return contracted, std * across.square().div(r * r).pow(1 / 3)
 
 
-def _contract_cpu(points: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
+def _contract_cpu(points: Tensor, std: Tensor, scale: float, shift: float) -> tuple[Tensor, Tensor]:
     flat = points.detach().reshape(-1, 3).contiguous().numpy()
     deviations = std.detach().float().expand(points.shape[:-1]).reshape(-1).contiguous().numpy()
     out, scaled = np.empty_like(flat), np.empty_like(deviations)
-    parallel_for(_contract, len(flat), POINTS_PER_PIECE, flat, deviations, out, scaled)
+    parallel_for(
+        _contract,
+        len(flat),
+        POINTS_PER_PIECE,
+        flat,
+        deviations,
+        *map(np.float32, (scale, shift)),
+        out,
+        scaled,
+    )
     return torch.from_numpy(out).reshape(points.shape), torch.from_numpy(scaled).reshape(points.shape[:-1])
 
 
 @kernel(error_model="numpy")
-def _contract(begin, end, points, std, out, scaled):
+def _contract(begin, end, points, std, scale, shift, out, scaled):
     """In blocks, each step a loop without branches that the compiler can vectorise."""
     one, two, third = np.float32(1), np.float32(2), np.int32(3)
     square = np.empty(BLOCK, np.float32)
@@ -71,6 +85,7 @@ def _contract(begin, end, points, std, out, scaled):
             for _ in range(2):
                 cube = root * root * root
                 root *= (cube + v + v) / (cube + cube + v)
-            to[i] = s[i] * root * root
+            to[i] = s[i] * root * root * scale
         for i in range(stop - start):
-            o[i, 0], o[i, 1], o[i, 2] = p[i, 0] * across[i], p[i, 1] * across[i], p[i, 2] * across[i]
+            for axis in range(3):
+                o[i, axis] = p[i, axis] * across[i] * scale + shift
