@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from .moved import keep_old_places
+
 if TYPE_CHECKING:
     from .errors import EmptyHullError, VisDomError
     from .geometry.cameras import Cameras, Rays
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     from .workflow.runs import Run, open_run, save_image, train
     from .workflow.scenes import carve, check, load
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOME = {
     "Cameras": "visdom_plugin.geometry.cameras",
@@ -72,6 +74,9 @@ if not TYPE_CHECKING:  # a type checker would take any name for a public one
         if name in _HOME:
             return getattr(import_module(_HOME[name]), name)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+keep_old_places()
 
 
 def __dir__() -> list[str]:
