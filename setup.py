@@ -1,7 +1,7 @@
 """Setup: the README for a package index, where links into the tree lead nowhere.
 
-VISDOM_README_BASE=https://HOST/OWNER/visdom-plugin makes them, and the pictures, absolute, at the release's tag. Without
-it, links keep their words and pictures are left out.
+VISDOM_README_BASE=https://HOST/OWNER/visdom-plugin makes them, and the pictures, absolute, at the release's tag.
+Without it, links keep their words and pictures are left out.
 """
 
 import os
