@@ -19,7 +19,7 @@ from visdom_plugin.nerf.rendering.volume import composite, weights_from_density
 from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.metrics import psnr, whiten
 
-NEAR, FAR, SAMPLES, WHITE = 2.0, 8.0, 48, torch.ones(3)
+NEAR, FAR, SAMPLES, WHITE = 2.0, 8.0, 16, torch.ones(3)
 
 
 def main(steps: int = 1000, rays: int = 512, downscale: float = 2, hull: bool = True) -> None:

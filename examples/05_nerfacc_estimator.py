@@ -33,8 +33,8 @@ def main(steps: int = 60, rays: int = 400, downscale: float = 4) -> None:
 
     def density(x):
         where = ((x - low) / (high - low) * 2 - 1)[None, None, None]
-        raw = torch.nn.functional.grid_sample(grid, where, align_corners=True)
-        return torch.nn.functional.softplus(raw).reshape(-1)
+        raw = torch.nn.functional.grid_sample(grid, where, align_corners=True).reshape(-1)
+        return torch.nn.functional.softplus(raw) * ((x > low) & (x < high)).all(-1)
 
     for step in range(steps):
         batch = batches.pixel_batch(step, rays)

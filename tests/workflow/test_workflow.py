@@ -134,6 +134,12 @@ def test_errors_name_arguments_and_the_nearest_name(call, said, scene, run, tmp_
     assert not list(tmp_path.iterdir())
 
 
+def test_an_error_keeps_its_topic():
+    with pytest.raises(vd.VisDomError) as error:
+        vd.load("nowhere")
+    assert error.value.topic == "no-scene" and "data" in error.value.todo
+
+
 def test_inverted_masks_are_refused_as_by_the_command(tmp_path):
     scene = vd.load(downscale=2)
     views = replace(scene.train, masks=[~mask for mask in scene.train.masks])

@@ -116,7 +116,7 @@ def _name_built_in(folder: Path | None) -> str | None:
         return named_built_in(folder)
     except ConfigError as error:
         cause = "a column without `root:` names built-in scenes; that of a data root needs --root NAME=DIR"
-        raise ConfigError(error.what, cause=cause, todo=error.todo) from error
+        raise ConfigError(error.what, cause=cause, todo=error.todo, topic=error.topic) from error
 
 
 def hash_built_in() -> str:
