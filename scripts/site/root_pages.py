@@ -7,6 +7,8 @@ file of the tree the words stay.
 from __future__ import annotations
 
 import ast
+import inspect
+import json
 import posixpath
 import re
 from pathlib import Path
@@ -50,12 +52,28 @@ def relink(text: str, source: str, place: str) -> str:
 
 
 def show_examples() -> str:
-    """The scripts of examples/ with what their docstrings say."""
-    parts = [EXAMPLES_HEAD]
-    for path in sorted((ROOT / "examples").rglob("*.py")):
-        source = path.read_text(encoding="utf-8")
-        name, said = path.relative_to(ROOT).as_posix(), ast.get_docstring(ast.parse(source))
-        title, _, rest = (said or name).partition("\n")
-        code = source.split('"""', 2)[2] if said else source
-        parts.append(f"## {title.rstrip('.')}\n\n`{name}`\n\n{rest}\n\n```py\n{code.strip()}\n```\n")
+    """The scripts and notebooks of examples/ with what they say of themselves."""
+    parts = ["# Examples\n\nWhat lies in `examples/`, in the order to read it. Each runs as it stands.\n"]
+    folder = ROOT / "examples"
+    for path in sorted([*folder.rglob("*.py"), *folder.glob("*.ipynb")]):
+        show = show_notebook if path.suffix == ".ipynb" else show_script
+        parts.append(show(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")))
     return "\n".join(parts)
+
+
+def show_script(name: str, source: str) -> str:
+    """A section: the docstring's first line as the heading, the rest of it, the code."""
+    said = ast.get_docstring(ast.parse(source))
+    title, _, rest = (said or name).partition("\n")
+    code = source.split('"""', 2)[2] if said else source
+    return f"## {title.rstrip('.')}\n\n`{name}`\n\n{inspect.cleandoc(rest)}\n\n```py\n{code.strip()}\n```\n"
+
+
+def show_notebook(name: str, source: str) -> str:
+    """A section: the cells, one after the other, headings a level lower."""
+    parts = []
+    for cell in json.loads(source)["cells"]:
+        text = "".join(cell["source"])
+        code = cell["cell_type"] == "code"
+        parts.append(f"```py\n{text}\n```" if code else re.sub("^#", "##", text, flags=re.M))
+    return "\n\n".join([parts[0], f"`{name}`", *parts[1:]]) + "\n"

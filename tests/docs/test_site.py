@@ -94,6 +94,20 @@ def test_links_out_of_docs_become_the_sites_own(part):
     assert pages.relink(code, "README.md", "index.md") == code
 
 
+def test_the_page_of_examples_has_every_script_and_notebook(part):
+    pages = part("root_pages")
+    shown = pages.show_examples()
+    for path in (ROOT / "examples").iterdir():
+        if path.suffix in (".py", ".ipynb"):
+            assert f"`examples/{path.name}`" in shown
+    script = pages.show_script("a.py", '"""One thing.\n\n    python a.py\n"""\n\nprint(1)\n')
+    assert script == "## One thing\n\n`a.py`\n\npython a.py\n\n```py\nprint(1)\n```\n"
+    cells = (
+        '{"cells": [{"cell_type": "markdown", "source": ["# A"]}, {"cell_type": "code", "source": ["b"]}]}'
+    )
+    assert pages.show_notebook("n.ipynb", cells) == "## A\n\n`n.ipynb`\n\n```py\nb\n```\n"
+
+
 def test_the_extra_is_bounded():
     project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     (needed,) = re.findall(r"^docs = \[(.*)\]$", project, re.M)

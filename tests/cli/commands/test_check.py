@@ -74,7 +74,8 @@ def test_findings_exit_with_1_and_name_the_view(folder, tmp_path, kind, change, 
     assert main([str(spoilt), "--quiet"]) == 1
     assert capsys.readouterr().out == ""
     assert main([str(spoilt)]) == 1
-    assert "1 finding" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "1 finding" in shown and shown.count("docs/guide/troubleshooting.md#findings") == 1
 
 
 def test_sheet_and_report_are_written(folder, tmp_path, capsys):
