@@ -4,6 +4,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 from tests.docs.test_links import anchors
 from visdom_plugin import errors
 from visdom_plugin.cli.entry import run
@@ -40,6 +42,12 @@ def test_names_in_the_source_are_registered_and_those_registered_are_used():
     usual = {kind.usual for kind in errors.VisDomError.__subclasses__()}
     assert used() <= {*errors.TOPICS, *KINDS}
     assert set(errors.TOPICS) <= used() | usual
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_finding_is_shown(kind):
+    (picture,) = re.findall(r"!\[[^\]]+\]\((\S+)\)", SECTIONS[kind])
+    assert picture == f"../pictures/findings/{kind}.webp"
 
 
 def test_a_command_ends_its_message_with_the_place_that_tells_more(capsys):

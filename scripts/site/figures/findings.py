@@ -28,8 +28,8 @@ from visdom_plugin.figures.check_sheet import draw_check
 from visdom_plugin.hull.checks.check import check
 from visdom_plugin.hull.checks.findings import KINDS
 
-WIDTH = 620
-"""Of a picture, in pixels."""
+WIDTH, LARGEST = 620, 2 / 3
+"""Of a picture, in pixels; and how large it may be beside check.png."""
 
 
 def turned(c: Capture) -> Capture:
@@ -61,10 +61,10 @@ def all_turned(c: Capture) -> Capture:
 
 
 def shown_once(c: Capture) -> Capture:
-    """A part of the object within the frame of one photograph alone."""
-    points = load(None, views=4).mesh[0]
-    high = points[:, 2].max()
-    return seen_alone(c, 0, points[points[:, 2] > high - 0.12 * (high - points[:, 2].min())])
+    """A part of the object within the frame of one photograph of nine alone."""
+    across = load(None, views=4).mesh[0]
+    across = across[across[:, 1] > across[:, 1].max() - 0.2 * (across[:, 1].max() - across[:, 1].min())]
+    return seen_alone(capture_of(load(None, views=9, test=False).train), 7, across)
 
 
 def first(c: Capture) -> Capture:
@@ -121,9 +121,11 @@ def main() -> None:
         sheet = draw_check(views, [torch.as_tensor(m) for m in faulty.masks], found)
         lit = np.flatnonzero((sheet != sheet[-1, -1]).any((1, 2)))
         sheet = sheet[: lit[-1] + 8]
-        height = round(sheet.shape[0] * WIDTH / sheet.shape[1])
+        scale = min(WIDTH / sheet.shape[1], LARGEST)
         write_webp(
-            cv2.resize(sheet, (WIDTH, height), interpolation=cv2.INTER_AREA), args.out / f"{kind}.webp", 75
+            cv2.resize(sheet, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA),
+            args.out / f"{kind}.webp",
+            75,
         )
 
 
