@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import errno
 import logging
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
+from typing import TYPE_CHECKING, TextIO
 
 from visdom_plugin.cli.clashes import refuse_clashes
 from visdom_plugin.cli.early import read_early
+from visdom_plugin.cli.output.examples import examples_of, program_of
+from visdom_plugin.compute import ahead
 from visdom_plugin.compute.openmp import wait_briefly
+from visdom_plugin.compute.waiting import screen
 from visdom_plugin.errors import ConfigError, VisDomError, say_more
 from visdom_plugin.hull.wording import for_commands
 
@@ -47,6 +52,10 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
         _check_views(early.views)
         if not early.help:
             refuse_clashes(words)
+        elif examples := examples_of(command):
+            print("Examples:", *examples, sep="\n  ", end="\n\n")
+        screen.turn(not early.quiet)
+        ahead.prepare()
         with for_commands():
             return command(words) or 0
     except VisDomError as error:
@@ -55,9 +64,11 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
     except KeyboardInterrupt as stop:
         # By name, because importing the class would import torch.
         resumable = type(stop).__name__ == "Interrupted"
-        print(
-            "interrupted" + ("; the same command resumes" if resumable else ""), file=sys.stderr, flush=True
+        program = program_of(command)
+        again = (
+            "the same command resumes" if program is None else f"go on with: {shlex.join([program, *words])}"
         )
+        print("interrupted" + (f"; {again}" if resumable else ""), file=sys.stderr, flush=True)
         return INTERRUPTED
     except BrokenPipeError:
         # The reader went away, as in `visdom-methods | head`.
@@ -76,6 +87,9 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
     except Exception:
         print(BUG, file=sys.stderr)
         raise
+    finally:
+        screen.turn(False)
+        ahead.finish()
 
 
 def _check_views(text: str | None) -> None:
@@ -92,11 +106,23 @@ def set_up_logging(quiet: bool = False) -> None:
     """Warnings, and with `quiet` only errors, on stderr."""
     root = logging.getLogger()
     if not root.handlers:
-        handler = logging.StreamHandler()
+        handler = _Handler()
         handler.setFormatter(_Plain())
         root.addHandler(handler)
     for name in ("visdom_plugin", "datamodules", "method_configs"):
         logging.getLogger(name).setLevel(logging.ERROR if quiet else logging.INFO)
+
+
+if TYPE_CHECKING:
+    _StreamHandler = logging.StreamHandler[TextIO]
+else:
+    _StreamHandler = logging.StreamHandler
+
+
+class _Handler(_StreamHandler):
+    def emit(self, record: logging.LogRecord) -> None:
+        screen.clear()
+        super().emit(record)
 
 
 class _Plain(logging.Formatter):

@@ -295,7 +295,9 @@ def _without_method(early: Early, prog: str) -> NoReturn:
         raise ConfigError(f"a method is named with {WORD} before it", todo=f"{prog} {WORD}{stray[0]}")
     raise ConfigError(
         "no method is named",
-        todo=f"{prog} " + " | ".join(f"{WORD}{n}" for n in known.presets) + f"\n  help: {prog} --help",
+        todo=f"for example: {prog} {WORD}zipnerf+vd\n  methods: "
+        + ", ".join(f"{WORD}{n}" for n in known.presets)
+        + f"\n  help: {prog} --help",
     )
 
 
@@ -308,11 +310,16 @@ def choose_budget(budget: str, device: str, ask_torch: bool = True) -> tuple[Bud
         return cast(Budget, budget), f"budget {budget}"
     # Help must not wait for torch: without a driver there is no CUDA, and with one it is the likely case.
     if device == "auto":
-        device = "cuda" if Path("/dev/nvidiactl").exists() else "cpu"
+        device = "cuda" if may_use_cuda(device) else "cpu"
         if device == "cuda" and ask_torch:
             device = resolve_device("auto")
     chosen: Budget = "full" if device == "cuda" else "quick"
     return chosen, f"budget {chosen}, chosen for device {device}"
+
+
+def may_use_cuda(device: str) -> bool:
+    """Whether --device asks for CUDA, or finds a driver where it asks for nothing; without torch."""
+    return device == "cuda" or (device == "auto" and Path("/dev/nvidiactl").exists())
 
 
 def resolve_device(device: str) -> str:

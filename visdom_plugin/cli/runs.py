@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from datamodules.built_in import on_disk
 from visdom_plugin.cli import options
 from visdom_plugin.cli.scenes import make_data_manager, open_scene
+from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import CheckpointError, ConfigError
 from visdom_plugin.scene import Scene, hold_out
 
@@ -142,6 +143,7 @@ def _list_views(train: Sequence[str], test: Sequence[str]) -> dict[str, Any]:
     return {"views": len(train), "train_list": train_list, "test_list": test_list, "split": None}
 
 
+@phase("reading the run")
 def open_run(run: Path, data: Path | None, device_name: str, *, test: bool = True):
     """A trained method with its scene: (record, config, scene, method, hull, device, step).
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from visdom_plugin.compute.waiting import phase
 from visdom_plugin.scene import Scene, Views
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ def make_data_manager(views: Views, seed: int, device: torch.device) -> DataMana
     return DataManager(views, seed, device=device)
 
 
+@phase("reading the scene")
 def open_scene(
     path: Path | None,
     *,

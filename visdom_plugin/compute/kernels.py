@@ -3,22 +3,36 @@
 numba's own cache looks at the file that a function stands in. It would go on running old machine code after a
 change to another file, a function or a constant of which was compiled in. Here the cache is stamped with the code
 of the function and of all that it reaches, and with the values that they read. What counts is the code that this
-process has loaded, not files, which may have changed since; so any number of processes may share a cache.
+process has loaded, not files, which may have changed since; so any number of processes may share a cache. Of those
+that want the same kernel at the same time one compiles it, and the others load what it made.
 """
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import inspect
+import logging
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
 from numba import extending, njit
+from numba.core import event as events
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
+from visdom_plugin.compute.claims import Claim
+from visdom_plugin.compute.waiting import current
+
+log = logging.getLogger(__name__)
 Function = TypeVar("Function", bound=Callable[..., object])
 
 # Sums may be regrouped into vector lanes (the compiled order is fixed, so results repeat to the bit), but NaN
@@ -52,7 +66,8 @@ def kernel(
     def compile_later(function: Function) -> Function:
         dispatcher: Any = njit(**options | (_FAST if fast else {}))(function)
         if hasattr(dispatcher, "enable_caching"):  # not where NUMBA_DISABLE_JIT is set
-            dispatcher._cache = _StampedCache(dispatcher)
+            with suppress(RuntimeError):  # no folder for a cache can be written to
+                dispatcher._cache = _StampedCache(dispatcher)
         return dispatcher
 
     return compile_later
@@ -69,11 +84,80 @@ def fast_overload(stub: Callable[..., object]) -> Callable[[Function], Function]
     return register
 
 
+class Busy(Exception):
+    """Another process is compiling the kernel."""
+
+
+POLL = 0.01
+"""Seconds between two looks at what another process is compiling."""
+PATIENCE = 60.0
+"""Seconds of waiting for it, counted in looks (a machine may sleep); after them a kernel is compiled here, too."""
+
+saving = threading.Lock()
+"""Held while files of the cache are written."""
+
+
+class _State(events.Listener):
+    """What this process compiles: a kernel, and within it those that it calls."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+        self.waits = True
+        self.collects = False
+
+    @property
+    def asked_for(self) -> bool:
+        """The next kernel is one that somebody called."""
+        return self.depth == 0 and self.waits
+
+    def on_start(self, event: events.Event) -> None:
+        if self.depth == 0:
+            # numba makes much that lives until the kernel is done: looking through it takes a tenth of the time.
+            self.collects = gc.isenabled()
+            gc.disable()
+        self.depth += 1
+
+    def on_end(self, event: events.Event) -> None:
+        self.depth -= 1
+        cache = event.data["dispatcher"]._cache
+        # numba's own `is_failed` is true where nothing failed.
+        failed = getattr(event, "_exc_details", None) is not None
+        if failed and isinstance(cache, _StampedCache):
+            cache.claim.drop()
+        if self.depth == 0:
+            if self.collects:
+                gc.enable()
+            self.tell_ended()
+
+    def tell_ended(self) -> None:
+        watcher = current()
+        if self.asked_for and watcher is not None:
+            watcher.ended()
+
+
+_state = _State()
+events.register("numba:compile", _state)
+
+
+def compile_if_free(dispatcher: Dispatcher, types: tuple[Any, ...]) -> bool:
+    """Compiles a kernel for these types or loads it; False where another process is compiling it."""
+    with global_compiler_lock:
+        before, _state.waits = _state.waits, False
+        try:
+            dispatcher.compile(types)
+        except Busy:
+            return False
+        finally:
+            _state.waits = before
+    return True
+
+
 class _StampedCache(FunctionCache):
     def __init__(self, dispatcher: Dispatcher) -> None:
         super().__init__(dispatcher.py_func)
         self._dispatcher = dispatcher
         self._stamped = False
+        self.claim = Claim(Path(self.cache_path), self._impl.filename_base)
 
     def load_overload(self, sig: object, target_context: object) -> object:
         # numba looks here before it compiles and saves. At decoration, names that the function reads may still be
@@ -82,7 +166,44 @@ class _StampedCache(FunctionCache):
             stamp = fingerprint(self._dispatcher)
             self._cache_file = _StampedFile(self.cache_path, self._impl.filename_base, stamp)
             self._stamped = True
-        return super().load_overload(sig, target_context)
+        found = self._load(sig, target_context)
+        if found is not None:
+            return found
+        watcher = current() if _state.asked_for else None
+        if watcher is not None:
+            watcher.began()
+        elif _state.asked_for:
+            _tell_once()
+        looks = 0
+        while not self.claim.take() and looks * POLL < PATIENCE:
+            looks += 1
+            if _state.depth == 0 and not _state.waits:
+                raise Busy
+            if watcher is None or not watcher.help():
+                time.sleep(POLL)
+        # It may have been made since.
+        found = self._load(sig, target_context)
+        if found is not None:
+            self.claim.drop()
+            _state.tell_ended()
+        return found
+
+    def _load(self, sig: object, target_context: object) -> object:
+        with suppress(OSError):  # as below
+            return super().load_overload(sig, target_context)
+        return None
+
+    def save_overload(self, sig: object, data: object) -> None:
+        try:
+            with saving, suppress(OSError):  # a disk that is full or read-only costs time only
+                super().save_overload(sig, data)
+        finally:
+            self.claim.drop()
+
+
+@cache
+def _tell_once() -> None:
+    log.info("compiling kernels, once on this machine: up to half a minute")
 
 
 class _StampedFile(IndexDataCacheFile):

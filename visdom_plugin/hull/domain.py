@@ -77,7 +77,7 @@ class VisibleDomain(HullSettings):
         from visdom_plugin.hull.checks.degenerate import stand_at_one_point
         from visdom_plugin.hull.checks.mask_checks import look_inverted
 
-        log.info("carving the hull (its kernels are compiled once per machine, which takes 10 to 30 s)")
+        log.info("carving the hull")
         silhouettes = gather_silhouettes(cameras, masks, ignore, dilate_px=self.dilate_px)
         if stand_at_one_point(cameras):
             from visdom_plugin.hull.checks.explain_failure import explain_one_point

@@ -15,6 +15,7 @@ import torch
 
 from visdom_plugin import registry
 from visdom_plugin.atomic_files import appearing, finite
+from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import CheckpointError, ConfigError, EmptyHullError, PluginError, SceneError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
@@ -267,12 +268,14 @@ def build(
         saved: the folder in which the run keeps its hull, if it has one already: it is read, not carved again.
     """
     began = time.monotonic()
-    hull = find_hull(config, views, saved)
+    with phase("carving the hull"):
+        hull = find_hull(config, views, saved)
     hull_s = time.monotonic() - began
     near = move_near(views)
     near_hull = hull if hull is None or near is views else hull.relative_to(near.origin.numpy())
     method: Method = preset.load()(config)
-    method.setup(near, make_hooks(config, near_hull, near), hull=near_hull, device=device, seed=seed)
+    with phase("setting up the method"):
+        method.setup(near, make_hooks(config, near_hull, near), hull=near_hull, device=device, seed=seed)
     if near is not views:
         method = LocalMethod(method, near.origin)
     return method, hull, hull_s
@@ -336,7 +339,8 @@ def assess(
         reference = hull
     elif (reference := read_hull(run_dir / "hull" / REFERENCE)) is None:
         log.info("the metric 'opacity outside the hull' needs the hull that is the same for every method:")
-        reference = carve_reference(scene.train)
+        with phase("carving the reference hull"):
+            reference = carve_reference(scene.train)
         if reference is not None:
             reference.save(run_dir / "hull" / REFERENCE)
     if len(views):

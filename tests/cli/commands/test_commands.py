@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -36,7 +37,9 @@ def test_training_ends_with_a_table_and_where_the_pictures_are(fakes, capsys):
     run = Path("runs/ball/4/fake/3")
     ((path, keywords),) = fakes
     assert path is None and keywords.items() >= {"views": 6, "downscale": 2.0, "seed": 3}.items()
-    assert "fake on the built-in scene (ball): 4 training views, budget quick, chosen for device" in err
+    assert "fake on the built-in scene, budget quick, chosen for device" in err.splitlines()[0]
+    assert "data: ball, 4 training views, 3 test views" in err
+    assert f"visdom-view {run} " in err.splitlines()[-3] and "visdom-export" in err.splitlines()[-1]
     for words in ("fake on ball, 3 test views", "PSNR", "dB", "SSIM", "silhouette IoU", "opacity outside"):
         assert words in out, words
     for name in ("renders/test_sheet.png", "renders/test", "export", "run.json"):
@@ -263,7 +266,8 @@ def test_an_interrupted_training_says_that_the_same_command_resumes(fakes, capsy
     with monkeypatch.context() as patch:
         patch.setattr(fake.FakeMethod, "train_step", interrupted_step)
         assert train.main([*TRAIN, "--quiet"]) == 130
-    assert capsys.readouterr().err == "interrupted; the same command resumes\n"
+    again = f"visdom-train {shlex.join([*TRAIN, '--quiet'])}"
+    assert capsys.readouterr().err == f"interrupted; go on with: {again}\n"
     assert train.main([*TRAIN]) == 0
     assert "resumed" in capsys.readouterr().err
 

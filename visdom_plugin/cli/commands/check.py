@@ -16,6 +16,7 @@ import tyro
 from datamodules.built_in import on_disk
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
+from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import PAGE, ConfigError, SceneError, list_some
 
 if TYPE_CHECKING:
@@ -161,6 +162,7 @@ def find_briefly(scene: Scene) -> list[dict[str, Any]]:
     return describe_check(found, views.names)["findings"]
 
 
+@phase("checking cameras and masks")
 def check_views(
     views: Views, masks: Sequence, *, k: int | None = None, brief: bool = False, layout: str | None = None
 ) -> Check:

@@ -15,6 +15,7 @@ from datamodules.built_in import PREFIX, on_disk
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.options import Device, SceneOptions, read_options
 from visdom_plugin.cli.subject import PointCloud, Subject, is_run, is_splat_file, open_subject
+from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -81,12 +82,13 @@ def _export(argv: Sequence[str]) -> None:
         _show(options)
         return
     target = _target(options)
-    if options.format == "dataset":
-        written = _write_dataset(options, target)
-    elif options.mesh or options.format in ("glb", "obj") or not _has_gaussians(options):
-        written = _write_mesh(options, target)
-    else:
-        written = _write_splats(options, target)
+    with phase("exporting"):
+        if options.format == "dataset":
+            written = _write_dataset(options, target)
+        elif options.mesh or options.format in ("glb", "obj") or not _has_gaussians(options):
+            written = _write_mesh(options, target)
+        else:
+            written = _write_splats(options, target)
     if not options.quiet:
         sys.stdout.write("".join(f"{path}\n" for path in written))
 

@@ -15,6 +15,8 @@ from visdom_plugin.cli.clashes import NEEDS_OF_HULL, refuse_unread
 from visdom_plugin.cli.commands.check import check_views, describe_check, summarise_fit
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
+from visdom_plugin.compute import ahead
+from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.inside.config import InsideConfig
@@ -82,6 +84,7 @@ def _main(argv: Sequence[str]) -> None:
     inside = _inside_config(options)
     if options.frames < 1:
         raise ConfigError(f"--frames is {options.frames}; it must be at least 1")
+    ahead.prepare("hull")
     from visdom_plugin.cli.scenes import open_scene
 
     masks = None
@@ -127,6 +130,7 @@ class MaskRequest:
     overwrite: bool
 
 
+@phase("carving and measuring the hull")
 def report_hull(
     domain: VisibleDomain,
     scene: Scene,

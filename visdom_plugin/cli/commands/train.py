@@ -8,6 +8,9 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from visdom_plugin.cli import entry, options
+from visdom_plugin.cli.output.terminal import say, show_next, show_result
+from visdom_plugin.compute.ahead import prepare
+from visdom_plugin.compute.waiting import phase
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -22,21 +25,24 @@ def _train(argv: Sequence[str]) -> None:
         sys.stdout.write(options.dump(request))
         return
     common.find_scene_folder()
-    device = options.resolve_device(common.device)
+    quiet = common.quiet
+    if not quiet:
+        data = "the built-in scene" if common.data is None else common.data
+        say(f"{request.preset.name} on {data}, {request.note}")
+    if not options.may_use_cuda(common.device):
+        prepare(f"train {request.preset.name}")
+    with phase("loading torch"):
+        device = options.resolve_device(common.device)
 
-    from visdom_plugin.cli.commands.check import warn_of_faults
-    from visdom_plugin.cli.output.terminal import say, show_result
-    from visdom_plugin.cli.runs import default_run_dir, train_as_asked
-    from visdom_plugin.cli.scenes import open_scene
-    from visdom_plugin.scene import describe_masks
+        from visdom_plugin.cli.commands.check import warn_of_faults
+        from visdom_plugin.cli.runs import default_run_dir, train_as_asked
+        from visdom_plugin.cli.scenes import open_scene
+        from visdom_plugin.scene import describe_masks
 
     scene = open_scene(common.data, **options.read_options(common))
     folder = common.out or default_run_dir(scene.name, len(scene.train), request.preset.name, common.seed)
-    if not common.quiet:
-        data = "the built-in scene" if common.data is None else common.data
-        say(
-            f"{request.preset.name} on {data} ({scene.name}): {len(scene.train)} training views, {request.note}"
-        )
+    if not quiet:
+        say(f"data: {scene.name}, {len(scene.train)} training views, {len(scene.test)} test views")
         if common.budget == "standard" and len(scene.train) < request.preset.standard_views:
             say(
                 f"budget standard gains from {request.preset.standard_views} views on; with {len(scene.train)}, "
@@ -56,12 +62,13 @@ def _train(argv: Sequence[str]) -> None:
         on_finished = partial(report_finished, scene=scene, run_dir=folder, device=device, check=find_briefly)
     with watching(folder) if common.view else nullcontext():
         record = train_as_asked(request, scene, folder, device, on_finished, common.tensorboard)
-    if not common.quiet:
+    if not quiet:
         if record["already_finished"]:
             say("this run is finished already; nothing was done (train again with --overwrite)")
         elif record["resumed_from"] is not None:
             say(f"resumed after step {record['resumed_from']}")
         show_result(record, folder)
+        show_next(folder)
 
 
 @contextmanager

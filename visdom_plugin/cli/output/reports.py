@@ -7,12 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from visdom_plugin.compute.waiting import phase
+
 if TYPE_CHECKING:
     from visdom_plugin.hull.hull import Hull
     from visdom_plugin.scene import Scene
     from visdom_plugin.training.evaluate import Renderer
 
 
+@phase("writing the report")
 def report_finished(
     record: dict[str, Any],
     method: Renderer,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from visdom_plugin.compute.waiting import screen
 from visdom_plugin.tables.measures import MEASURES
 
 ROWS = (
@@ -34,6 +36,7 @@ FILES = (
 
 def say(text: str) -> None:
     """One line for the user, on stderr so that stdout stays for results."""
+    screen.clear()
     print(text, file=sys.stderr, flush=True)
 
 
@@ -42,6 +45,16 @@ def show_files(folder: Path, named: Iterable[tuple[str, str]]) -> None:
     for label, name in named:
         if (folder / name).exists():
             print(f"{label:>8}: {folder / name}")
+
+
+def show_next(folder: Path) -> None:
+    """What a user may do with a finished run, as commands, on stderr."""
+    run = shlex.quote(str(folder))
+    page = folder / "report.html"
+    say(f"next: open {page}" if page.exists() else f"next: visdom-report {run}")
+    say(f"      visdom-view {run}                  # in the browser, beside the photographs")
+    say(f"      visdom-render {run} --path orbit   # a flight around it")
+    say(f"      visdom-export {run} --format html  # one file to send; also glb, obj, spz and more")
 
 
 def show_oracle(record: dict[str, Any]) -> None:

@@ -174,7 +174,7 @@ class RadianceField(CorrectsColours, ABC, Generic[Config]):
 
     def _warm_up(self, camera: Cameras) -> None:
         """Compiles the CPU kernels of a step, or loads them, on 16 pixels; the gradients are dropped."""
-        log.info("loading the CPU kernels (compiled once per machine, which takes 10 to 30 s)")
+        log.info("loading the CPU kernels")
         origins, directions = (x.float() for x in spread_rays(camera, 4))
         n = len(origins)
         batch = PixelBatch(

@@ -101,7 +101,7 @@ class SplatMethod(CorrectsColours, ABC, Generic[Config]):
 @cache
 def _load_kernels() -> None:
     """Once in a process, which may set up many runs."""
-    log.info("loading the CPU kernels (compiled once per machine, which takes 10 to 30 s)")
+    log.info("loading the CPU kernels")
     warm_up()
 
 
