@@ -132,6 +132,11 @@ def read_list(job: str) -> list[Kernel]:
     return [Kernel(listed["kernels"][i]) for i in listed["jobs"].get(job, ())]
 
 
+def training_job(method: str) -> str:
+    """The job that trains a method, in whatever variant."""
+    return f"train {method.partition('+')[0]}"
+
+
 def count_cores() -> int:
     """Cores that this process may use, or was told to."""
     free = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from visdom_plugin.cli import entry, options
 from visdom_plugin.cli.output.terminal import say, show_next, show_result
-from visdom_plugin.compute.ahead import prepare
+from visdom_plugin.compute.ahead import prepare, training_job
 from visdom_plugin.compute.waiting import phase
 
 
@@ -30,7 +30,7 @@ def _train(argv: Sequence[str]) -> None:
         data = "the built-in scene" if common.data is None else common.data
         say(f"{request.preset.name} on {data}, {request.note}")
     if not options.may_use_cuda(common.device):
-        prepare(f"train {request.preset.name}")
+        prepare(training_job(request.preset.name))
     with phase("loading torch"):
         device = options.resolve_device(common.device)
 
