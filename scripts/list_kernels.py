@@ -87,7 +87,7 @@ def main(words: list[str]) -> None:
         for job in words or commands:
             lists[job] = run(commands[job], os.environ.get("NUMBA_CACHE_DIR", folder))
             print(f"{len(lists[job]):4d} kernels  {job}", flush=True)
-    write(LIST, lists)
+            write(LIST, lists)
     return None
 
 
