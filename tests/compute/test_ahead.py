@@ -190,7 +190,7 @@ def test_there_is_no_second_process_on_one_core(told, starts, cache, monkeypatch
     monkeypatch.setenv("OMP_NUM_THREADS", told)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
     monkeypatch.setattr(ahead, "start_process", started.append)
-    ahead.prepare("hull", quiet=True)
+    ahead.prepare("hull")
     monkeypatch.setattr(ahead, "_process", None)
     ahead.finish()
     assert bool(started) == starts
@@ -207,7 +207,7 @@ def test_nothing_is_started_where_all_is_cached(monkeypatch):
 def test_the_line_counts_kernels_and_seconds_left(monkeypatch):
     ready = set()
     monkeypatch.setattr(Kernel, "is_cached", lambda self: self.text in ready)
-    helper = ahead.Helper([Kernel(text) for text in "abcdef"], quiet=True)
+    helper = ahead.Helper([Kernel(text) for text in "abcdef"])
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
     helper.began()
@@ -216,13 +216,14 @@ def test_the_line_counts_kernels_and_seconds_left(monkeypatch):
     assert helper.describe() == "compiling kernels, once on this machine: 4 of 6, about 2 s left"
     ready = set("abcdef")
     assert helper.describe() == "compiling kernels, once on this machine: 4 s"
+    helper.ended()
 
 
 def test_while_one_waits_the_next_free_kernel_is_compiled(monkeypatch):
     done = []
     monkeypatch.setattr(Kernel, "is_cached", lambda self: self.text == "cached")
     monkeypatch.setattr(Kernel, "compile", lambda self, _: self.text != "busy" and not done.append(self.text))
-    helper = ahead.Helper([Kernel(text) for text in ("cached", "busy", "one", "two")], quiet=True)
+    helper = ahead.Helper([Kernel(text) for text in ("cached", "busy", "one", "two")])
     assert [helper.help() for _ in range(3)] == [True, True, False]
     assert done == ["one", "two"]
 
@@ -241,19 +242,48 @@ class Screen:
         pass
 
 
+@pytest.fixture
+def quick_screen(monkeypatch):
+    for name, seconds in (("FIRST", 0.05), ("EVERY", 0.1), ("TICK", 0.01)):
+        monkeypatch.setattr(waiting.Screen, name, seconds)
+    made = waiting.Screen()
+    yield made
+    made.turn(False)
+
+
 @pytest.mark.parametrize("terminal", [True, False])
-def test_the_line_moves_while_one_waits_and_is_gone_afterwards(terminal, monkeypatch):
-    screen = Screen(terminal)
-    monkeypatch.setattr(sys, "stderr", screen)
-    monkeypatch.setattr(waiting.Line, "EVERY", 0.1)
-    monkeypatch.setattr(waiting.Line, "TICK", 0.01)
-    numbers = iter(range(1000))
-    line = waiting.Line(lambda: f"{next(numbers)} of 9")
-    line.show()
-    wait_for(lambda: "1 of 9" in screen.text)
-    line.hide()
-    said = screen.text
+def test_the_line_moves_in_silence_and_is_gone_afterwards(terminal, quick_screen, monkeypatch):
+    output, numbers = Screen(terminal), iter(range(10000))
+    monkeypatch.setattr(sys, "stderr", output)
+
+    def text():
+        return f"{next(numbers)} of 9"
+
+    quick_screen.begin(text)
+    time.sleep(0.2)
+    assert output.text == ""  # nobody turned it on
+    quick_screen.turn(True)
+    quick_screen.begin(text)
+    wait_for(lambda: "1 of 9" in output.text)
+    quick_screen.end(text)
+    said = output.text
     time.sleep(0.3)
-    assert screen.text == said
+    assert output.text == said
     assert said.endswith("\r\x1b[K" if terminal else " of 9\n")
     assert ("\r" in said) == terminal
+
+
+def test_what_is_said_stands_on_a_line_of_its_own(quick_screen, monkeypatch):
+    output = Screen(terminal=True)
+    monkeypatch.setattr(sys, "stderr", output)
+    quick_screen.turn(True)
+    quick_screen.begin(lambda: "carving")
+    wait_for(lambda: "carving" in output.text)
+    quick_screen.clear()
+    assert output.text.endswith("\r\x1b[K")
+
+
+def test_a_phase_ends_with_its_block_whatever_happens(monkeypatch):
+    with pytest.raises(KeyError), waiting.phase("reading"):
+        raise KeyError("x")
+    assert waiting.screen._phases == []
