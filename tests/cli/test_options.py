@@ -132,7 +132,7 @@ def test_a_missing_or_unreadable_file_is_said(tmp_path):
     [
         (
             [],
-            r"no method is named[\s\S]*visdom-train method:zipnerf\+vd[\s\S]*methods: method:fake, method:fake\+fast",
+            r"no method is named[\s\S]*visdom-train method:zipnerf\+vd[\s\S]*: method:fake, method:fake\+fast",
         ),
         (["--quiet", "fake"], r"named with method: before it[\s\S]*visdom-train method:fake"),
         (["method:fke"], r"no method 'fke'; did you mean 'fake'\?[\s\S]*method:fake, method:fake\+fast"),
