@@ -19,7 +19,7 @@ from typing import Any
 from visdom_plugin.compute.ahead import LIST, Kernel, training_job
 
 METHODS = (
-    *("3dgs-go+vd", "corgs-lite+vd", "fsgs-lite+vd", "visdom-gs"),
+    *("3dgs-go+vd", "corgs-lite+vd", "fsgs-lite+vd", "splatfields-lite+vd", "visdom-gs"),
     *("ingp+vd", "vaxnerf+hull", "visdom-field", "zerorf-lite+vd", "zipnerf-lite+vd"),
 )
 """One variant of each: others have the same kernels but for a few. GaussianObject needs weights from elsewhere."""

@@ -59,11 +59,12 @@ def test_the_same_command_again_says_that_the_run_is_finished(trained, capsys):
 def test_another_command_on_the_same_directory_is_refused_with_the_way_out(trained, capsys):
     assert train.main([*TRAIN, "--method.lr", "0.5"]) == 2
     out, err = capsys.readouterr()
-    assert out == "" and err.splitlines()[-4:] == [
+    assert out == "" and err.splitlines()[-5:] == [
         "error: the run directory holds another run (there -> now):",
         "    config.lr: 0.05 -> 0.5",
         "  where: run",
         "  what to do: --out run-2 keeps both, --overwrite replaces what is there",
+        "  more: docs/guide/troubleshooting.md#other-run",
     ]
     assert train.main([*TRAIN[:-1], "run-2", "--method.lr", "0.5", "--quiet"]) == 0
     assert train.main([*TRAIN, "--method.lr", "0.25"]) == 2 and "--out run-3 keeps" in capsys.readouterr().err
