@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from datamodules import load
+from datamodules.built_in import DEFAULT
 from datamodules.layouts import actorshq
 from datamodules.recognise import FORMATS, recognise
+from datamodules.synthetic.catalogue import find_object
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import _draw, make_scene
-from datamodules.synthetic.shape import watering_can
 from tests.datamodules.files.test_undistort import LENSES
 from tests.datamodules.layouts import layout_writers as w
 from tests.datamodules.layouts.prepared_writer import write
@@ -27,7 +28,7 @@ CONFIG = SyntheticConfig(size=(64, 48), train_views=7, test_views=2)
 
 
 def _rendered(cameras: Cameras) -> Views:
-    pictures = _draw(CONFIG, cameras, watering_can())
+    pictures = _draw(CONFIG, cameras, find_object(DEFAULT))
     names = tuple(f"v{i:02d}" for i in range(len(cameras)))
     return Views(cameras, tuple(p[0] for p in pictures), tuple(p[1] for p in pictures), names)
 
