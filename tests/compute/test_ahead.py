@@ -103,6 +103,16 @@ def test_the_second_process_ends_with_the_first_however_that_ends(cache):
     wait_for(lambda: not is_running(second))
 
 
+def test_the_second_process_imports_nothing_from_the_users_folder(cache, tmp_path, monkeypatch):
+    (tmp_path / "numba.py").write_text("open('imported', 'w').close()")
+    monkeypatch.chdir(tmp_path)
+    kernel = Kernel(PACK)
+    process = ahead.start_process([kernel])
+    wait_for(kernel.is_cached)
+    ahead.end_process(process)
+    assert not (tmp_path / "imported").exists()
+
+
 def is_running(pid):
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"

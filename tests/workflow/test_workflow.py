@@ -124,6 +124,14 @@ def test_a_folder_is_found_again_with_its_options(tmp_path, monkeypatch):
         (lambda s, r: r.render(s.test.cameras), "render takes one camera, and was given 16"),
         (lambda s, r: r.orbit(0), "frames is 0"),
         (lambda s, r: vd.open_run(r.path.parent), "one level too high"),
+        (lambda s, r: vd.carve("builtin:duck"), "carve takes a scene, and was given 'builtin:duck'"),
+        (lambda s, r: vd.check(None), "check takes a scene"),
+        (lambda s, r: vd.train("ingp", "builtin:duck"), "train takes a scene"),
+        (lambda s, r: vd.train("ingp", s, seed="a"), "seed cannot be 'a'"),
+        (lambda s, r: vd.save_image("view.jpg", s.test.images[0]), "writes PNG, not 'view.jpg'"),
+        (lambda s, r: vd.save_image("v.png", torch.zeros(3, 5, 6)), "permute(1, 2, 0)"),
+        (lambda s, r: vd.save_image("v.png", torch.full((5, 6, 3), 255.0)), "numbers reach 255"),
+        (lambda s, r: vd.save_image("v.png", torch.full((5, 6), torch.nan)), "numbers reach nan"),
     ],
 )
 def test_errors_name_arguments_and_the_nearest_name(call, said, scene, run, tmp_path, monkeypatch):

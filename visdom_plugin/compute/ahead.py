@@ -4,7 +4,6 @@ numba compiles one function at a time, in Python, while the command waits. On a 
 process starts with the command, while that imports torch and reads the scene. Both take kernels from the same
 list, in the order of their need, and find what the other has made in numba's cache on disk. Nothing depends on
 the list but time: a kernel that it lacks is compiled when it is called.
-
 """
 
 from __future__ import annotations
@@ -31,7 +30,9 @@ LIST = Path(__file__).with_name("ahead.json")
 """What commands call: kernels with types as `Kernel.spell` writes them, and their numbers by job."""
 WORTH_A_PROCESS = 3
 """Kernels to compile from which on a second process is started."""
-PACKAGE = (__package__ or "").split(".")[0]
+PACKAGE = __name__.split(".")[0]
+PROGRAM = f"import sys; sys.path[:] = [p for p in sys.path if p]; from {__name__} import main; main()"
+"""The second process. Like the command itself it does not import what lies in the user's folder."""
 
 _ARRAY = re.compile(r"(\w+)\[(\d)([CFA])(r?)\]")
 
@@ -216,7 +217,7 @@ def start_process(kernels: Sequence[Kernel]) -> subprocess.Popen[bytes] | None:
     """A second process that compiles kernels; it ends with this one at the latest."""
     try:
         process = subprocess.Popen(
-            [sys.executable, "-m", __name__],
+            [sys.executable, "-c", PROGRAM],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -255,7 +256,3 @@ def _leave_with_input() -> None:
 
     with saving:  # no half-written file is left in the cache
         os._exit(0)
-
-
-if __name__ == "__main__":
-    main()

@@ -29,6 +29,9 @@ from visdom_plugin.training.runs.config_io import from_plain
 from visdom_plugin.training.runs.run_directory import Record, read_record
 from visdom_plugin.workflow.wording import for_callers
 
+BRIGHT = 4.0
+"""Renders may exceed 1, by harmonics; no picture in [0, 1] reaches this."""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -167,7 +170,12 @@ def train(
         EmptyHullError: nothing is left of the hull.
     """
     preset = registry.find(method.removeprefix("method:"))
-    asked = from_plain(Common(), {"budget": budget, "device": device}, "train")
+    if not isinstance(scene, Scene):
+        raise ConfigError(
+            f"train takes a scene, and was given {scene!r:.60}",
+            todo='open it first: train(method, load("DIR")); of Views of your own make a Scene',
+        )
+    asked = from_plain(Common(), {"budget": budget, "device": device, "seed": seed}, "train")
     found = resolve_device(asked.device)
     chosen, _ = choose_budget(asked.budget, found)
     config = from_plain(preset.settings(chosen), settings, f"settings of {preset.name}")
@@ -214,19 +222,37 @@ def open_run(
     return Run(path, scene, torch.device(resolve_device(device)))
 
 
+@for_callers
 def save_image(path: str | Path, picture: Render | Tensor) -> Path:
     """Writes a picture as PNG.
 
     Args:
+        path: ends in .png.
         picture: a Render, or a tensor (H, W, 3) or (H, W) in [0, 1], or uint8 or bool.
 
     Returns:
         The path.
+
+    Raises:
+        ConfigError: another ending, another shape, or numbers that are no brightness in [0, 1].
     """
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise ConfigError(f"save_image writes PNG, not {path.name!r}", todo="end the name in .png")
     image = picture.rgb if isinstance(picture, Render) else torch.as_tensor(picture)
+    if image.dim() not in (2, 3) or (image.dim() == 3 and image.shape[-1] != 3) or not image.numel():
+        raise ConfigError(
+            f"the picture has the shape {tuple(image.shape)}",
+            todo="give (H, W, 3) or (H, W); of (3, H, W) make picture.permute(1, 2, 0)",
+        )
     if image.dtype == torch.uint8:
         image = image / 255
     image = image.detach().cpu().float()
-    path = Path(path)
+    if not image.abs().max() <= BRIGHT:  # NaN, too
+        raise ConfigError(
+            f"the picture's numbers reach {float(image.abs().max()):.4g}",
+            cause="they are 0 to 255 and not in [0, 1], or depths, or not finite",
+            todo="divide by the largest that they can be",
+        )
     write_png(path, to_bytes(image if image.dim() == 3 else image[..., None].expand(-1, -1, 3)))
     return path

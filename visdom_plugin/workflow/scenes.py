@@ -9,7 +9,7 @@ from typing import Any
 from visdom_plugin.cli.commands.check import check_views
 from visdom_plugin.cli.options import READING, Common, describe_reading, read_options
 from visdom_plugin.cli.scenes import carving_views, open_scene
-from visdom_plugin.errors import unknown_name
+from visdom_plugin.errors import ConfigError, unknown_name
 from visdom_plugin.hull.checks.findings import Finding
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
@@ -51,6 +51,20 @@ def load(data: str | Path | None = None, *, views: int = 4, downscale: float = 1
     return replace(scene, source=scene.source | describe_reading(replace(asked, data=folder)))
 
 
+def training_views(scene: Scene | Views, asking: str) -> Views:
+    """The training views of a scene, or the views themselves.
+
+    Raises:
+        ConfigError: it is neither, such as a folder's name.
+    """
+    if isinstance(scene, Scene | Views):
+        return scene.train if isinstance(scene, Scene) else scene
+    raise ConfigError(
+        f"{asking} takes a scene, and was given {scene!r:.60}",
+        todo=f'open it first: {asking}(load("DIR")), or Views of your own',
+    )
+
+
 @for_callers
 def check(scene: Scene | Views, *, k: int | None = None) -> list[Finding]:
     """What is wrong with cameras, masks and photographs of the training views, the surest first.
@@ -65,7 +79,7 @@ def check(scene: Scene | Views, *, k: int | None = None) -> list[Finding]:
     Raises:
         SceneError: no view has a mask.
     """
-    train = scene.train if isinstance(scene, Scene) else scene
+    train = training_views(scene, "check")
     layout = scene.source.get("layout") if isinstance(scene, Scene) else None
     views, masks = carving_views(train)
     return list(check_views(views, masks, k=k, layout=layout).findings)
@@ -88,5 +102,5 @@ def carve(scene: Scene | Views, **settings: Any) -> Hull:
     for name in settings:
         if name not in valid:
             raise unknown_name(f"carve has no setting {name!r}", name, valid, todo="its settings")
-    views = scene.train if isinstance(scene, Scene) else scene
+    views = training_views(scene, "carve")
     return VisibleDomain(**settings).carve(*views.silhouettes())

@@ -1,4 +1,4 @@
-"""Draws the picture of the built-in scenes, docs/pictures/built_in_scenes.webp: python scripts/draw_built_in.py"""
+"""Draws the built-in scenes, docs/pictures/built_in_scenes.webp: python scripts/site/figures/built_in_scenes.py"""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from datamodules.built_in import NAMES
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
 
-PICTURE = Path(__file__).parents[1] / "docs/pictures/built_in_scenes.webp"
+PICTURE = Path(__file__).parents[3] / "docs/pictures/built_in_scenes.webp"
 SIZE, GAP = 280, 4
 SHOWN = {"watering-can": (2, 5), "duck": (4, 2), "figure": (0, 4), "chair": (4, 3)}
 """Of each scene, a training view and a test view."""
