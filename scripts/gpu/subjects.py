@@ -10,7 +10,7 @@ import project
 import torch
 from torch import Tensor
 
-METHODS = ("3dgs-go", "ingp", "corgs-lite", "zipnerf-lite", "zerorf-lite")
+METHODS = ("3dgs-go", "ingp", "corgs-lite", "zipnerf-lite", "zerorf-lite", "fsgs-lite", "splatfields-lite")
 VARIANTS = tuple(name + suffix for name in METHODS for suffix in ("+vd", ""))
 
 

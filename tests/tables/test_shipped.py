@@ -99,7 +99,8 @@ def test_an_edition_of_the_main_table_has_every_variant_of_every_method():
         "fsgs-lite",
         "corgs-lite",
     )
-    assert rows == {m + v for m in methods for v in ("", "+mask", "+vd")}
+    of_variants = {m + v for m in methods for v in ("", "+mask", "+vd")}
+    assert rows == of_variants | {"vaxnerf", "vaxnerf+hull"}
     assert load_table("main", "captures").seeds == (0, 1, 2)
 
 
