@@ -190,6 +190,10 @@ def recognise(root: Path) -> dict[str, str]:
             if reason is not None:
                 found[name] = reason
     covered = {name for other in found for name in FORMATS[other].covers}
+    if {"nerfstudio", "colmap"} <= found.keys():
+        from datamodules.layouts.transforms import is_repeated
+
+        covered |= {"colmap"} if is_repeated(root) else set()
     return {name: reason for name, reason in found.items() if name not in covered}
 
 

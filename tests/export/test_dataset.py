@@ -1,10 +1,14 @@
 """A data set that was exported is read back as the same capture, by each of its two sets of cameras."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
 
 from datamodules import load
+from datamodules.layouts.transforms import REPEATED_BY
+from visdom_plugin.errors import SceneError
 from visdom_plugin.export.dataset import write_dataset
 from visdom_plugin.export.upright import upright
 from visdom_plugin.hull.domain import VisibleDomain
@@ -40,6 +44,19 @@ def test_cameras_pictures_and_masks_come_back(tmp_path, scene, hull, data_format
     assert back.points is not None
     inside = hull.contains(back.points[0], margin_voxels=1)
     assert inside.all() and len(inside) == 20_000
+
+
+def test_the_folder_has_one_reading(tmp_path, scene, hull):
+    write_dataset(tmp_path / "d", scene, hull)
+    back = load(tmp_path / "d", views=4)
+    assert [n.removeprefix("images/").removesuffix(".png") for n in back.train.names] == list(
+        scene.train.names
+    )
+    assert len(back.test) == len(scene.test)
+    file = tmp_path / "d" / "transforms.json"
+    file.write_text(json.dumps({k: v for k, v in json.loads(file.read_text()).items() if k != REPEATED_BY}))
+    with pytest.raises(SceneError, match="in more than one way"):
+        load(tmp_path / "d", views=4)
 
 
 def test_moved_cameras_see_the_moved_hull(tmp_path, scene, hull):

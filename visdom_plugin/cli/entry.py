@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from visdom_plugin.cli.clashes import refuse_clashes
 from visdom_plugin.cli.early import read_early
-from visdom_plugin.cli.output.examples import examples_of, program_of
+from visdom_plugin.cli.output.examples import examples_of, missing_subject, program_of
 from visdom_plugin.compute import ahead
 from visdom_plugin.compute.openmp import wait_briefly
 from visdom_plugin.compute.waiting import screen
@@ -43,6 +43,7 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
     """
     words = list(sys.argv[1:] if argv is None else argv)
     early = read_early(words)
+    examples = examples_of(command)
     wait_briefly()
     set_up_logging(early.quiet)
     if early.version:
@@ -50,9 +51,11 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
         return 0
     try:
         _check_views(early.views)
+        if not words and (missing := missing_subject(command)):
+            raise ConfigError(missing, todo=", or ".join(examples))
         if not early.help:
             refuse_clashes(words)
-        elif examples := examples_of(command):
+        elif examples:
             print("Examples:", *examples, sep="\n  ", end="\n\n")
         screen.turn(not early.quiet)
         ahead.prepare()
@@ -61,6 +64,10 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
     except VisDomError as error:
         print(f"error: {error}\n{say_more(error.topic)}", file=sys.stderr)
         return USER_ERROR
+    except SystemExit as stop:
+        if stop.code == USER_ERROR and examples:  # tyro's: it has said what is wrong with the words
+            print(f"for example: {examples[0]}", file=sys.stderr)
+        raise
     except KeyboardInterrupt as stop:
         # By name, because importing the class would import torch.
         resumable = type(stop).__name__ == "Interrupted"

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from datamodules.layouts.transforms import REPEATED_BY
 from visdom_plugin.atomic_files import write_bytes, write_json
 from visdom_plugin.export.meshes import Mesh, move
 from visdom_plugin.figures.contact_sheet import picture_names, write_png
@@ -29,6 +30,7 @@ from visdom_plugin.scene import Scene, Views
 from visdom_plugin.seeding import generator
 
 POINTS = 20_000
+_MODEL = "sparse/0"
 _PINHOLE = 1
 """COLMAP's number of the camera model without distortion."""
 
@@ -53,9 +55,9 @@ def write_dataset(folder: Path, scene: Scene, hull: Hull | None, motion: Tensor 
             names.append(name)
             frames.append(part)
     points = _points(hull, scene.train, motion) if hull is not None else None
-    write_transforms(folder, cameras, names, frames, points is not None)
-    write_colmap(folder / "sparse" / "0", cameras, names, points)
-    made = [folder / name for name in ("images", "masks", "transforms.json", "sparse/0")]
+    write_transforms(folder, cameras, names, frames, points is not None, _MODEL)
+    write_colmap(folder / _MODEL, cameras, names, points)
+    made = [folder / name for name in ("images", "masks", "transforms.json", _MODEL)]
     if hull is not None and points is not None:
         mesh = move(Mesh(*hull.to_mesh()), motion.numpy())
         write_bytes(folder / "hull.ply", mesh_ply(*mesh))
@@ -85,6 +87,7 @@ def write_transforms(
     names: list[str],
     parts: list[str] | None = None,
     points: bool = False,
+    model: str | None = None,
 ) -> None:
     """Writes transforms.json of pictures in `folder/images`.
 
@@ -93,6 +96,7 @@ def write_transforms(
         names: of the pictures, with their ending.
         parts: "train" or "test" for each; None leaves the split to who reads it.
         points: whether sparse_pc.ply lies beside.
+        model: the COLMAP model beside it with the same cameras, so that the folder has one reading.
     """
     frames = []
     for camera, name in zip(cameras, names, strict=True):
@@ -119,6 +123,8 @@ def write_transforms(
         ]
     if points:
         content["ply_file_path"] = "sparse_pc.ply"
+    if model is not None:
+        content[REPEATED_BY] = model
     write_json(folder / "transforms.json", content)
 
 

@@ -37,6 +37,7 @@ _LEGEND = (
     ("ruled out by other masks", _WRONG),
     ("room this view removes", _ROOM),
 )
+_LEGEND_WIDTH = 8 + sum(7 * len(text) + 16 for text, _ in _LEGEND)
 _RESOLUTION = 96
 
 
@@ -61,7 +62,7 @@ def draw_check(views: Views, masks: Sequence[Tensor | np.ndarray], found: Check)
         cells.append((picture, str(views.names[view]), ", ".join(named.get(view, []))))
     tall = max(c[0].shape[0] for c in cells) + _LABEL
     rows = -(-len(cells) // columns)
-    wide = columns * (_CELL + 6) + 6
+    wide = max(columns * (_CELL + 6) + 6, _LEGEND_WIDTH)
     said = [line for f in found.findings for line in wrap(f"{f.sure}: {f.what}", wide // 7)][:_LINES]
     top = 48 + 18 * max(1, len(said))
     sheet = Canvas(top + rows * tall, wide, 24)

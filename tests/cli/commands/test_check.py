@@ -102,6 +102,18 @@ def test_the_sheet_is_red_where_a_mask_disagrees(sound):
     assert redness(FAULTS["mirrored_mask"](capture, 1).capture) > 500
 
 
+def test_the_legend_is_whole_for_a_single_view(sound):
+    def blue_words(views):
+        found = check_views(views, views.masks)
+        sheet = draw_check(views, views.masks, found).astype(int)
+        # The legend's line, of which the last part is blue; its background is dark grey.
+        line = next(i for i in range(len(sheet)) if (sheet[i] - (255, 214, 0) == 0).all(-1).any())
+        return int((sheet[line : line + 12, ..., 2] - sheet[line : line + 12, ..., 0] > 100).sum())
+
+    whole = blue_words(sound.train)
+    assert whole > 100 and blue_words(sound.train.take([0])) == whole
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

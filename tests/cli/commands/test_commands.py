@@ -14,8 +14,8 @@ import cv2
 import pytest
 
 from tests.training import fake
-from visdom_plugin.cli import entry, runs
-from visdom_plugin.cli.commands import evaluate, methods, render, train
+from visdom_plugin.cli import convert, entry, runs
+from visdom_plugin.cli.commands import evaluate, export, methods, prepare, render, report, train
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.scene import Views
 from visdom_plugin.training.runs.run_directory import hash_views
@@ -54,6 +54,22 @@ def test_the_same_command_again_says_that_the_run_is_finished(trained, capsys):
     assert train.main(TRAIN) == 0
     out, err = capsys.readouterr()
     assert "finished already" in err and "PSNR" in out and "step " not in err
+
+
+@pytest.mark.parametrize("command", [convert, evaluate, export, prepare, render, report, train])
+def test_a_command_that_needs_words_answers_none_with_an_example(command, capsys):
+    assert command.main([]) == entry.USER_ERROR
+    out, err = capsys.readouterr()
+    assert out == "" and re.match(
+        r"error: no [\w, ]+ named\n  what to do: (for example: )?visdom-\w+ \S+", err
+    )
+
+
+def test_a_missing_word_is_answered_with_an_example(capsys):
+    with pytest.raises(SystemExit) as end:
+        render.main(["--path", "orbit"])
+    assert end.value.code == entry.USER_ERROR
+    assert capsys.readouterr().err.splitlines()[-1].startswith("for example: visdom-render runs/")
 
 
 def test_another_command_on_the_same_directory_is_refused_with_the_way_out(trained, capsys):

@@ -9,6 +9,10 @@ from typing import Any
 RUN = "runs/SCENE/VIEWS/METHOD/SEED"
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "check": ("visdom-check DIR",),
+    "convert": (
+        "visdom-convert DIR --out calibration.csv",
+        "visdom-convert calibration.csv --out DIR/sparse/0",
+    ),
     "evaluate": (
         f"visdom-eval {RUN}",
         "visdom-eval --leave-one-out method:ingp+vd --data DIR --views 4",
@@ -24,6 +28,13 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "view": (f"visdom-view {RUN}", "visdom-view DIR"),
 }
 """By the module of the command, the one to try first at the front."""
+_SUBJECTS = {
+    "convert": "no model and no table is named",
+    "evaluate": "no run is named",
+    "export": "no run, file or scene is named",
+    "render": "no run and no file is named",
+}
+"""What is missing where a command that cannot do without is called without words."""
 
 
 def examples_of(command: Callable[..., Any]) -> tuple[str, ...]:
@@ -35,3 +46,8 @@ def program_of(command: Callable[..., Any]) -> str | None:
     """Its name on the command line."""
     examples = examples_of(command)
     return examples[0].split()[0] if examples else None
+
+
+def missing_subject(command: Callable[..., Any]) -> str | None:
+    """What a command lacks when it is called without words; None where it needs none, or says so itself."""
+    return _SUBJECTS.get(Path(command.__code__.co_filename).stem)

@@ -10,22 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from visdom_plugin.geometry.cameras import Cameras, look_at_point
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.votes import gather_silhouettes
 from visdom_plugin.hull.checks.causes.fault_hypotheses import QUIET_PX, Suspicion, find_causes
 from visdom_plugin.hull.checks.causes.intrinsics import find_astray, find_other_unit, measure_focal_range
 from visdom_plugin.hull.checks.causes.pose_conventions import IN_MEMORY, PoseFaults
-from visdom_plugin.hull.checks.causes.turned_view import Turn, measure_turn
+from visdom_plugin.hull.checks.causes.turned_view import measure_turn
 from visdom_plugin.hull.checks.covisibility import (
-    LEAST_K,
-    LOST,
     USUAL_K,
     Advice,
     advise_k,
-    measure_spread,
 )
 from visdom_plugin.hull.checks.degenerate import stand_at_one_point
-from visdom_plugin.hull.checks.findings import Finding, Name, Sure
+from visdom_plugin.hull.checks.findings import Finding, Name
 from visdom_plugin.hull.checks.mask_checks import (
     check_border,
     check_content,
@@ -33,16 +30,21 @@ from visdom_plugin.hull.checks.mask_checks import (
     find_repeated,
     look_inverted,
 )
+from visdom_plugin.hull.checks.sentences import (
+    DISAGREE_PX,
+    say_cause,
+    say_clustered,
+    say_covisibility,
+    say_disagreement,
+    say_one_point,
+    say_too_few,
+    share_of_length,
+)
 from visdom_plugin.hull.foreign import to_numpy
 from visdom_plugin.hull.outlines.distance_fields import OBJECT_PX, Outlines, draw_outlines, turn_over
 from visdom_plugin.hull.outlines.silhouette_consistency import Coherence, measure_coherence
-from visdom_plugin.hull.wording import wording
 
-CLUSTERED_DEGREES = 60.0
-"""Views within this angle leave a hull more than 1.7 times as deep as the object."""
-_DISAGREE_PX, _SPEAKING_PX = 0.1, 0.5
-_DEAR = 0.2
-"""Share of a mask that no other view shows: up to here a note, beyond it a finding."""
+_SPEAKING_PX = 0.5
 _RAYS, _BRIEF_VIEWS = 1024, 16
 
 
@@ -107,7 +109,7 @@ def check(
     if brief and len(usable) > _BRIEF_VIEWS:
         usable = usable[np.arange(_BRIEF_VIEWS) * len(usable) // _BRIEF_VIEWS]
     if len(own) < 2:
-        found.append(_too_few(len(own)))
+        found.append(say_too_few(len(own)))
     if len(usable) < 2:
         notes, found = _split([*found, *repeated])
         return Check(found, notes, None, None, tuple(usable.tolist()))
@@ -124,7 +126,7 @@ def check(
     found += units
     causes, fit, left = find_causes(outlines, brief=brief, poses=poses)
     if stand_at_one_point(chosen) and not any(c.kind == "axes" for c in causes):
-        notes, found = _split([*found, *repeated, _one_point(len(chosen))])
+        notes, found = _split([*found, *repeated, say_one_point(len(chosen))])
         return Check(found, notes, None, fit, tuple(usable.tolist()))
     astray = find_astray(chosen)
     if astray and _views_alone(causes, fit):
@@ -136,22 +138,22 @@ def check(
     turn = measure_turn(outlines, causes[0]) if single else None
     if turn is not None:
         causes = [causes[0]._replace(detail="")]
-    found += [_cause(c, usable, names, poses, turn) for c in causes]
+    found += [say_cause(c, usable, names, poses, turn) for c in causes]
     ambiguous = any(c.rivals for c in causes)
-    if fit.score > _DISAGREE_PX and not ambiguous:
-        found.append(_disagreement(fit, usable[left], names))
+    if fit.score > DISAGREE_PX and not ambiguous:
+        found.append(say_disagreement(fit, usable[left], names))
     rest = outlines.keep(left)
     advice = None
     if left.sum() >= 2 and not any(c.kind in ("axes", "scale", "turned", "order", "swapped") for c in causes):
         kept = Name([names[i] for i in usable[left]])
         advice = advise_k(rest, kept, fit, USUAL_K if k is None else k)
         # Views that do not fit each other seem to have little in common at any K.
-        if not causes and fit.score <= _DISAGREE_PX:
-            found += _covisibility(advice, usable[left], k, names)
-        found += _clustered(rest, fit, chosen)
+        if not causes and fit.score <= DISAGREE_PX:
+            found += say_covisibility(advice, usable[left], k, names)
+        found += say_clustered(rest, fit, chosen)
     notes, found = _split(found)
     found.sort(key=lambda f: ("certain", "likely", "possible").index(f.sure))
-    told = brief or causes or units or fit.score > _DISAGREE_PX or left.sum() < 2
+    told = brief or causes or units or fit.score > DISAGREE_PX or left.sum() < 2
     span = None if told else measure_focal_range(rest, fit.score)
     return Check(found, notes, advice, fit, tuple(usable[left].tolist()), span)
 
@@ -169,18 +171,6 @@ def _filled(mask: np.ndarray, unknown: np.ndarray | None) -> np.ndarray:
 
 def _split(found: list[Finding]) -> tuple[list[Finding], list[Finding]]:
     return [f for f in found if f.note], [f for f in found if not f.note]
-
-
-def _too_few(count: int) -> Finding:
-    return Finding(
-        "few",
-        f"there is {'one view' if count else 'no view'} with a mask: nothing says how deep the object is, and no "
-        "hull can be carved",
-        tuple(range(count)),
-        "certain",
-        count,
-        wording().more_views,
-    )
 
 
 def _repeated(
@@ -223,11 +213,11 @@ def _inverted(
     if fit.score <= QUIET_PX and after.score > 10 * QUIET_PX:
         return [], outlines
     views = tuple(int(usable[k]) for k in flagged)
-    sound = after.score <= _DISAGREE_PX and after.power > max(_SPEAKING_PX, fit.power)
+    sound = after.score <= DISAGREE_PX and after.power > max(_SPEAKING_PX, fit.power)
     whose = "all masks are" if len(views) == len(masks) else f"the mask of {names[views[0]]} is"
     if 1 < len(views) < len(masks):
         whose = f"the masks of {names.all_of(views)} are"
-    evidence = f"turned over, the masks fit together to {_share(after.score)} of the object's length"
+    evidence = f"turned over, the masks fit together to {share_of_length(after.score)} of the object's length"
     said = Finding(
         "inverted",
         f"{whose} foreground along most of the image's border: background is marked"
@@ -240,21 +230,9 @@ def _inverted(
     return [said], turned
 
 
-def _one_point(count: int) -> Finding:
-    return Finding(
-        "centres",
-        f"all {count} cameras stand at one point, from which nothing can be told of depth",
-        (),
-        "certain",
-        float(count),
-        "give each pose its camera's position; on a turntable, world-to-camera matrices taken for their inverses "
-        "look like this: invert them",
-    )
-
-
 def _views_alone(causes: list[Suspicion], fit: Coherence) -> bool:
     """Whether something is wrong, and nothing but single views is there to blame."""
-    wrong = bool(causes) or fit.score > _DISAGREE_PX or fit.power < _SPEAKING_PX
+    wrong = bool(causes) or fit.score > DISAGREE_PX or fit.power < _SPEAKING_PX
     return wrong and all(c.kind == "view" for c in causes)
 
 
@@ -276,121 +254,3 @@ def _join(
         ):
             left.append(cause)
     return repeated, left
-
-
-def _share(px: float) -> str:
-    return f"{px / OBJECT_PX:.2%}"
-
-
-_TODO = {
-    "scale": "scale the intrinsics with the images: a photograph resized by s has s times the focal length and "
-    "principal point",
-    "order": "check how images, masks and poses are matched: sort them by the same key",
-    "turned": "turn photographs and masks back: the poses were estimated from them the other way round, as a "
-    "viewer shows them that follows EXIF's orientation",
-    "swapped": "exchange them back, photographs and masks, or their poses",
-    "view": "look at this view's mask and pose, or leave it out",
-}
-
-
-def _cause(
-    cause: Suspicion, usable: np.ndarray, names: Name, poses: PoseFaults, turn: Turn | None
-) -> Finding:
-    views = tuple(int(usable[v]) for v in cause.views)
-    after = f"{_share(cause.after)} of the object's length in the mean"
-    gain = f"undone, masks and cameras miss each other by {after} in place of {_share(cause.before)}"
-    if cause.kind == "view":
-        gain = f"without it the other views miss each other by {after}, with it by {_share(cause.before)}"
-        what = f"{names[views[0]]} does not fit the others"
-        if cause.rivals:
-            rivals = tuple(int(usable[v]) for v in cause.rivals)
-            views = tuple(sorted((*views, *rivals)))
-            what = f"one of {names.all_of(views)} does not fit the others"
-        what += f" ({cause.detail})" if cause.detail else ""
-    elif cause.kind == "swapped":
-        what = f"photographs and masks of {names.all_of(views)} are exchanged"
-    else:
-        what = cause.detail
-    for kind, others, detail in cause.others[:3]:
-        other = names.all_of([int(usable[v]) for v in others]) + ": " if others else ""
-        what += f"; or {other}{detail}" if kind != "swapped" else f"; or {other}exchanged"
-    if cause.before <= QUIET_PX:
-        gain = f"as given, no view rules out anything for another; undone they do, and miss each other by {after}"
-    ratio = min(cause.after / max(cause.before, 1e-9), 1.0)
-    sure: Sure = "certain" if cause.before > _DISAGREE_PX and ratio < 0.1 else "likely"
-    sure = "possible" if cause.rivals or cause.others else sure
-    todo = dict(poses)[cause.detail] if cause.kind == "axes" else _TODO[cause.kind]
-    alternatives = tuple(sorted({kind for kind, _, _ in cause.others}))
-    said = Finding(cause.kind, f"{what}: {gain}", views, sure, 1 - ratio, todo, alternatives)
-    if turn is None:
-        return said
-    what = f"{said.what}; its camera seems turned by about {turn.degrees:.1f} degrees (a small move of it, or of "
-    what += f"its mask, looks the same): turned back, all miss each other by {_share(turn.after)}"
-    todo = f"look whether its mask lies on its photograph; where it does, {wording().refine.format(view=views[0])}"
-    return said._replace(what=what, todo=f"{todo}; or leave the view out", turned_deg=round(turn.degrees, 2))
-
-
-def _disagreement(fit: Coherence, views: np.ndarray, names: Name) -> Finding:
-    worst = np.argsort(-np.nan_to_num(fit.contradicted))[:3]
-    named = tuple(int(views[w]) for w in worst)
-    share = float(np.nan_to_num(fit.contradicted)[worst[0]])
-    return Finding(
-        "disagreement",
-        f"masks and cameras contradict each other by {_share(fit.score)} of the object's length in the mean, and "
-        f"no single cause explains it; worst in {names.all_of(named)}",
-        named,
-        "likely" if share > 0.1 else "possible",
-        share,
-        f"{wording().sheet}; check poses and intrinsics, then the masks of these views",
-    )
-
-
-def _covisibility(advice: Advice, views: np.ndarray, asked: int | None, names: Name) -> list[Finding]:
-    if not advice.covered:
-        return []
-    wanted, found = USUAL_K if asked is None else asked, []
-    if advice.k < min(wanted, max(len(views), LEAST_K) if asked is None else wanted):
-        if advice.k + 1 not in advice.covered:
-            what, lost = f"K = {wanted} is more than the {len(views)} usable views", np.ones(len(views))
-        else:
-            what = f"too little is seen in common for K = {wanted}: {advice.why.partition(': ')[2]}"
-            lost = advice.covered[LEAST_K] - advice.covered[advice.k + 1]
-        set_k = wording().set_k.format(k=advice.k)
-        todo = f"use K = {advice.k} ({set_k}), or views that show more of the object in common"
-        found.append(_seen(what, views, lost, todo, note=asked is None))
-    alone = advice.covered[1] - advice.covered[LEAST_K]
-    if alone.max() > LOST:
-        shown = [f"{lost:.1%} of {names[v]}" for v, lost in zip(views, alone, strict=True) if lost > LOST]
-        what = f"no other view shows a part of the mask, which every K from {LEAST_K} on loses: {', '.join(shown)}"
-        todo = "add a view that shows this part, too; K = 1 would keep it, but opens the hull to the cameras"
-        found.append(_seen(what, views, alone, todo, note=float(alone.max()) <= _DEAR))
-    return found
-
-
-def _seen(what: str, views: np.ndarray, lost: np.ndarray, todo: str, note: bool) -> Finding:
-    """A finding on what the views see in common; `lost` (N,) is the share that each view's mask loses."""
-    if 2 * (lost > LOST).sum() > len(lost):
-        todo += (
-            "; where they do show it, poses or intrinsics are wrong: with too long a focal length views miss "
-        )
-        todo += "each other"
-    concerned = tuple(int(v) for v in views[lost > LOST])
-    return Finding("covisibility", what, concerned, "certain", float(lost.max()), todo, note=note)
-
-
-def _clustered(outlines: Outlines, fit: Coherence, cameras: Cameras) -> list[Finding]:
-    middle = look_at_point(cameras.to(dtype=torch.float64)).cpu().numpy() if fit.ball is None else fit.ball[0]
-    spread = measure_spread(outlines.centres, middle)
-    if spread.degrees >= CLUSTERED_DEGREES:
-        return []
-    return [
-        Finding(
-            "clustered",
-            f"all views look from within {spread.degrees:.0f} degrees of each other (opposite sides count as "
-            f"one): the hull may be {spread.stretch:.1f} times as deep as the object",
-            (),
-            "certain" if spread.degrees < 0.67 * CLUSTERED_DEGREES else "likely",
-            spread.degrees,
-            "add views from the sides; the visible domain gains little from views of similar directions",
-        )
-    ]
