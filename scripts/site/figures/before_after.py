@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -15,12 +16,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from datamodules import load
+from visdom_plugin import Scene, Views
 from visdom_plugin.figures.canvas import drawing
 from visdom_plugin.figures.contact_sheet import picture_names, to_bytes
 from visdom_plugin.training.metrics import whiten
 from visdom_plugin.training.runs.run_directory import read_record
 
 PICTURES = Path(__file__).parents[3] / "docs" / "pictures"
+MAKES = ("before_after.webp",)
 VIEWS = (4, 11)
 """Test views that are shown."""
 TITLES = {
@@ -40,17 +43,29 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=PICTURES / "before_after.webp")
     args = parser.parse_args()
     scene = load(None, views=4)
+    write_webp(compare(scene, args.runs, VIEWS, TITLES), args.out)
+
+
+def compare(
+    scene: Scene, runs: Sequence[Path], shown: Sequence[int], titles: Mapping[str, str]
+) -> np.ndarray:
+    """(H, W, 3) uint8: the scene's photographs, then unseen views in truth and by finished runs.
+
+    Args:
+        shown: positions of the test views, a row each.
+        titles: of the runs, by method.
+    """
     names = picture_names(scene.test.names)
-    columns = [("truth", [_white(scene.test, i) for i in VIEWS])]
-    for run in args.runs:
+    columns = [("truth", [_on_white(scene.test, i) for i in shown])]
+    for run in runs:
         record = read_record(run)
         psnr = record["metrics"]["test"]["psnr"]
-        pictures = [cv2.imread(str(run / "renders/test" / f"{names[i]}.png"))[..., ::-1] for i in VIEWS]
-        columns.append((f"{TITLES[record['method']]}\n{psnr:.1f} dB", pictures))
-    write_webp(draw([_white(scene.train, i) for i in range(4)], columns), args.out)
+        pictures = [cv2.imread(str(run / "renders/test" / f"{names[i]}.png"))[..., ::-1] for i in shown]
+        columns.append((f"{titles[record['method']]}\n{psnr:.1f} dB", pictures))
+    return draw([_on_white(scene.train, i) for i in range(len(scene.train))], columns)
 
 
-def _white(views, index: int) -> np.ndarray:
+def _on_white(views: Views, index: int) -> np.ndarray:
     return to_bytes(whiten(views.images[index], views.masks[index]))
 
 

@@ -11,7 +11,8 @@ from datamodules.built_in import NAMES
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
 
-PICTURE = Path(__file__).parents[3] / "docs/pictures/built_in_scenes.webp"
+MAKES = ("built_in_scenes.webp",)
+PICTURE = Path(__file__).parents[3] / "docs/pictures" / MAKES[0]
 SIZE, GAP = 280, 4
 SHOWN = {"watering-can": (2, 5), "duck": (4, 2), "figure": (0, 4), "chair": (4, 3)}
 """Of each scene, a training view and a test view."""

@@ -26,6 +26,7 @@ from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.splat.gaussians import Gaussians
 from visdom_plugin.splat.rasterise import rasterise
 
+MAKES = tuple(f"concept_{name}.webp" for name in ("visual_hull", "k", "band", "outside_loss", "inner_shape"))
 HULL, INNER, TRUTH, BAND = "#7aa6d8", "#2b6cb0", "#c53030", "#dd9b1f"
 SEEN = ListedColormap(["#ffffff", "#eef2f7", "#d9e2ee", "#bfd0e4", "#9dbbdb"])
 """Colours of space by how many of four cameras see it."""
@@ -78,14 +79,15 @@ def main() -> None:
     scene = load(None, views=4)
     hulls = {k: VisibleDomain(k=k).carve(*scene.train.silhouettes()) for k in (1, 2, 3, 4)}
     with drawing():
-        for name, figure in {
-            "concept_visual_hull": draw_visual_hull(scene),
-            "concept_k": draw_k(scene),
-            "concept_band": draw_band(scene, hulls[3]),
-            "concept_outside_loss": draw_outside_loss(scene, hulls[3]),
-            "concept_inner_shape": draw_inner_shape(scene, hulls[3]),
-        }.items():
-            write_webp(pixels_of(figure), args.out / f"{name}.webp", quality=80)
+        figures = (
+            draw_visual_hull(scene),
+            draw_k(scene),
+            draw_band(scene, hulls[3]),
+            draw_outside_loss(scene, hulls[3]),
+            draw_inner_shape(scene, hulls[3]),
+        )
+        for name, figure in zip(MAKES, figures, strict=True):
+            write_webp(pixels_of(figure), args.out / name, quality=80)
 
 
 def level_plane(scene: Scene, half: float, step: float) -> Plane:

@@ -28,6 +28,7 @@ from visdom_plugin.figures.check_sheet import draw_check
 from visdom_plugin.hull.checks.check import check
 from visdom_plugin.hull.checks.findings import KINDS
 
+MAKES = tuple(f"findings/{kind}.webp" for kind in KINDS)
 WIDTH, LARGEST = 620, 2 / 3
 """Of a picture, in pixels; and how large it may be beside check.png."""
 
@@ -106,12 +107,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, default=PICTURES / "findings")
+    parser.add_argument("--out", type=Path, default=PICTURES)
     parser.add_argument("--only", nargs="*", choices=KINDS, default=KINDS)
     args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / "findings").mkdir(parents=True, exist_ok=True)
     sound = capture_of(load(None, views=6, test=False).train)
-    for kind in args.only:
+    for kind, name in zip(KINDS, MAKES, strict=True):
+        if kind not in args.only:
+            continue
         faulty = EXAMPLES[kind](sound)
         found = check(faulty.cameras, faulty.masks, faulty.images, faulty.names)
         kinds = [f.kind for f in (*found.findings, *found.notes)]
@@ -124,7 +127,7 @@ def main() -> None:
         scale = min(WIDTH / sheet.shape[1], LARGEST)
         write_webp(
             cv2.resize(sheet, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA),
-            args.out / f"{kind}.webp",
+            args.out / name,
             75,
         )
 

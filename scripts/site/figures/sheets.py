@@ -1,0 +1,55 @@
+"""Sheets of unseen views of the first built-in scene, a row per method and the truth on top.
+
+python scripts/site/figures/sheets.py [--runs DIR] [--out DIR]
+
+Trains what is not in DIR yet, half a minute to a minute each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
+
+from before_after import PICTURES, write_webp
+from trained import train
+
+from benchmarks.methods.compare_pictures import draw_runs
+
+
+class Sheet(NamedTuple):
+    """What one picture shows."""
+
+    methods: tuple[str, ...]
+    views: int = 4
+    shown: int = 5
+    """Test views, evenly spaced."""
+
+
+SHEETS = {
+    "built_in_4_views.webp": Sheet(("3dgs-go", "3dgs-go+mask", "3dgs-go+vd")),
+    "fields_built_in_4_views.webp": Sheet(("zipnerf-lite", "zipnerf-lite+mask", "zipnerf-lite+vd")),
+    "visdom_gs_built_in_4_views.webp": Sheet(("3dgs-go+vd", "visdom-gs"), shown=6),
+    "visdom_gs_built_in_5_views.webp": Sheet(("3dgs-go+vd", "visdom-gs"), views=5, shown=6),
+}
+MAKES = tuple(SHEETS)
+
+
+def main() -> None:
+    """Draws all sheets."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=Path, default=Path("runs/figures"))
+    parser.add_argument("--out", type=Path, default=PICTURES)
+    args = parser.parse_args()
+    for name, sheet in SHEETS.items():
+        runs = [train(args.runs, method, sheet.views) for method in sheet.methods]
+        write_webp(draw_runs(runs, sheet.shown), args.out / name)
+
+
+if __name__ == "__main__":
+    main()
