@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from visdom_plugin.compute.openmp import wait_briefly
+from visdom_plugin.compute.process import wait_briefly
 
 wait_briefly()  # before torch is imported, as the commands do
 

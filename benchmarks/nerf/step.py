@@ -15,7 +15,7 @@ import statistics
 import time
 from dataclasses import replace
 
-from visdom_plugin.compute.openmp import wait_briefly
+from visdom_plugin.compute.process import wait_briefly
 
 wait_briefly()  # before torch is imported, as the commands do
 

@@ -1,3 +1,4 @@
+# ruff: noqa: E402
 """Time of one training step of Gaussian splatting on the CPU, against a dense torch rasteriser in the same run.
 
     python benchmarks/splat/step.py [--repeats 15] [--sizes 200000x800]
@@ -14,12 +15,13 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
-import os
 import resource
 import time
 
-# As the commands ask of torch: its threads else spin on the cores that the kernels need.
-os.environ.setdefault("GOMP_SPINCOUNT", "2000")
+from visdom_plugin.compute.process import keep_freed_memory, wait_briefly
+
+wait_briefly()  # before torch is imported, as the commands do
+keep_freed_memory()
 
 import torch
 

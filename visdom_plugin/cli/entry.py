@@ -14,7 +14,7 @@ from visdom_plugin.cli.clashes import refuse_clashes
 from visdom_plugin.cli.early import read_early
 from visdom_plugin.cli.output.examples import examples_of, missing_subject, program_of
 from visdom_plugin.compute import ahead
-from visdom_plugin.compute.openmp import wait_briefly
+from visdom_plugin.compute.process import keep_freed_memory, wait_briefly
 from visdom_plugin.compute.waiting import screen
 from visdom_plugin.errors import ConfigError, VisDomError, say_more
 from visdom_plugin.hull.wording import for_commands
@@ -45,6 +45,7 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
     early = read_early(words)
     examples = examples_of(command)
     wait_briefly()
+    keep_freed_memory()
     set_up_logging(early.quiet)
     if early.version:
         print(f"visdom-plugin {version('visdom-plugin')}")

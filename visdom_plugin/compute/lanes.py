@@ -4,13 +4,12 @@ A compiler may find the vectors in a loop or not, and says nothing when it does 
 loads 16 numbers, calculates with operators as with one, and stores them. Operations keep their order; only a
 product and the sum that takes it up may become one instruction.
 
-Calculations mix vectors with plain numbers of the same precision. Comparisons give 16 truth values, which `&`
-joins and `where` and `any_of` take.
+Calculations mix vectors with plain numbers, which are rounded to the vector's precision first. Comparisons give
+16 truth values, which `&` joins and `where` and `any_of` take.
 """
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Callable
 from functools import partial
@@ -36,21 +35,21 @@ class LanesType(types.Type):
 @register_model(LanesType)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, lanes: LanesType):
-        super().__init__(manager, lanes, _vector(lanes.element))
+        super().__init__(manager, lanes, vector_of(lanes.element))
 
 
-def _scalar(element: Any) -> ir.Type:
+def scalar_of(element: Any) -> ir.Type:
     if element == types.boolean:
         return ir.IntType(1)
     return ir.FloatType() if element == types.float32 else ir.DoubleType()
 
 
-def _vector(element: Any) -> ir.VectorType:
-    return ir.VectorType(_scalar(element), WIDTH)
+def vector_of(element: Any) -> ir.VectorType:
+    return ir.VectorType(scalar_of(element), WIDTH)
 
 
-def _constant(element: Any, values: list[float]) -> ir.Constant:
-    return ir.Constant(_vector(element), [ir.Constant(_scalar(element), v) for v in values])
+def constant_of(element: Any, values: list[float]) -> ir.Constant:
+    return ir.Constant(vector_of(element), [ir.Constant(scalar_of(element), v) for v in values])
 
 
 def _shuffle(builder: Any, a: Any, b: Any, picks: list[int]) -> Any:
@@ -64,7 +63,7 @@ def _spread(builder: Any, number: Any) -> Any:
     return _shuffle(builder, first, first, [0] * WIDTH)
 
 
-def _call(builder: Any, name: str, *arguments: Any) -> Any:
+def call_each(builder: Any, name: str, *arguments: Any) -> Any:
     kind = arguments[0].type
     letter = "f32" if kind.element == ir.FloatType() else "f64"
     function = cgutils.get_or_insert_function(
@@ -87,18 +86,16 @@ COMPARISONS: dict[Callable[..., Any], str] = {
 
 
 def _element_of(arguments: tuple[Any, ...]) -> Any:
-    """Of lanes mixed with numbers of the same precision; None for anything else."""
-    elements = {getattr(a, "element", a) for a in arguments if isinstance(a, LanesType | types.Float)}
-    any_lanes = any(isinstance(a, LanesType) for a in arguments)
-    if len(arguments) != 2 or not any_lanes or len(elements) != 1:
-        return None
-    return elements.pop() if all(isinstance(a, LanesType | types.Float) for a in arguments) else None
+    """Of lanes of one precision mixed with numbers; None for anything else."""
+    elements = {a.element for a in arguments if isinstance(a, LanesType)}
+    known = all(isinstance(a, LanesType | types.Float | types.Integer) for a in arguments)
+    return elements.pop() if known and len(arguments) == 2 and len(elements) == 1 else None
 
 
-def _operands(builder: Any, sig: Any, arguments: Any) -> list[Any]:
+def _operands(context: Any, builder: Any, kinds: Any, arguments: Any, element: Any) -> list[Any]:
     return [
-        a if isinstance(kind, LanesType) else _spread(builder, a)
-        for kind, a in zip(sig.args, arguments, strict=True)
+        a if isinstance(kind, LanesType) else _spread(builder, context.cast(builder, a, kind, element))
+        for kind, a in zip(kinds, arguments, strict=True)
     ]
 
 
@@ -111,10 +108,12 @@ def _register(function: Any, emit: Callable[[Any, Any, Any], Any], to: Callable[
             return None if result is None else signature(LanesType(result), *arguments)
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return emit(builder, *_operands(builder, sig, arguments))
+        return emit(builder, *_operands(context, builder, sig.args, arguments, _element_of(sig.args)))
 
-    for kinds in ((LanesType, LanesType), (LanesType, types.Float), (types.Float, LanesType)):
-        lower_builtin(function, *kinds)(lower)
+    for number in (types.Float, types.Integer):
+        lower_builtin(function, LanesType, number)(lower)
+        lower_builtin(function, number, LanesType)(lower)
+    lower_builtin(function, LanesType, LanesType)(lower)
 
 
 def _number(element: Any) -> Any:
@@ -148,7 +147,7 @@ def count_up(typing_context, number):
     """number, number + 1, ..., number + 15."""
 
     def generate(context, builder, signature, arguments):
-        steps = _constant(number, [float(i) for i in range(WIDTH)])
+        steps = constant_of(number, [float(i) for i in range(WIDTH)])
         return builder.fadd(_spread(builder, arguments[0]), steps)
 
     return LanesType(number)(number), generate
@@ -157,7 +156,7 @@ def count_up(typing_context, number):
 def _place(context: Any, builder: Any, array: Any, value: Any, index: Any) -> Any:
     data = context.make_array(array)(context, builder, value).data
     first = builder.gep(data, [index])
-    return builder.bitcast(first, _vector(array.dtype).as_pointer())
+    return builder.bitcast(first, vector_of(array.dtype).as_pointer())
 
 
 @intrinsic
@@ -166,7 +165,7 @@ def load(typing_context, array, index):
 
     def generate(context, builder, signature, arguments):
         out = builder.load(_place(context, builder, array, *arguments))
-        out.align = context.get_abi_sizeof(_scalar(array.dtype))
+        out.align = context.get_abi_sizeof(scalar_of(array.dtype))
         return out
 
     return LanesType(array.dtype)(array, types.intp), generate
@@ -178,24 +177,101 @@ def store(typing_context, array, index, lanes):
 
     def generate(context, builder, signature, arguments):
         place = _place(context, builder, array, *arguments[:2])
-        builder.store(arguments[2], place, align=context.get_abi_sizeof(_scalar(array.dtype)))
+        builder.store(arguments[2], place, align=context.get_abi_sizeof(scalar_of(array.dtype)))
         return context.get_dummy_value()
 
     return types.void(array, types.intp, lanes), generate
 
 
+def _each(context: Any, builder: Any, array: Any, value: Any, first: Any, step: Any) -> list[Any]:
+    """Pointers to numbers first, first + step, ... of an array."""
+    data = context.make_array(array)(context, builder, value).data
+    steps = [builder.mul(step, ir.Constant(step.type, lane)) for lane in range(WIDTH)]
+    return [builder.gep(data, [builder.add(first, s)]) for s in steps]
+
+
+@intrinsic
+def take(typing_context, array, index, step):
+    """Numbers index, index + step, ... of a contiguous array. Not bound checked."""
+
+    def generate(context, builder, signature, arguments):
+        out = ir.Constant(vector_of(array.dtype), ir.Undefined)
+        for lane, place in enumerate(_each(context, builder, array, *arguments)):
+            out = builder.insert_element(out, builder.load(place), ir.Constant(ir.IntType(32), lane))
+        return out
+
+    return LanesType(array.dtype)(array, types.intp, types.intp), generate
+
+
+@intrinsic
+def put(typing_context, array, index, step, lanes):
+    """Writes numbers index, index + step, ... of a contiguous array, of integers too. Not bound checked."""
+
+    def generate(context, builder, signature, arguments):
+        for lane, place in enumerate(_each(context, builder, array, *arguments[:3])):
+            number = builder.extract_element(arguments[3], ir.Constant(ir.IntType(32), lane))
+            builder.store(context.cast(builder, number, lanes.element, array.dtype), place)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, lanes), generate
+
+
+def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
+    """Columns of 16 vectors: blocks of two of them change places, four times, of 1, 2, 4 and 8 numbers."""
+    for block in (1, 2, 4, 8):
+        low = [i if not i & block else WIDTH + i - block for i in range(WIDTH)]
+        high = [i + block if not i & block else WIDTH + i for i in range(WIDTH)]
+        pairs = [(i, i + block) for i in range(WIDTH) if not i & block]
+        for i, j in pairs:
+            rows[i], rows[j] = (_shuffle(builder, rows[i], rows[j], picks) for picks in (low, high))
+    return rows
+
+
+@intrinsic
+def transpose(typing_context, array, index, step, out, at, out_step):
+    """Writes rows of 16 numbers at index, index + step, ... of an array as columns: to `at`, at + out_step, ...
+
+    Both arrays are contiguous; not bound checked.
+    """
+
+    def generate(context, builder, signature, arguments):
+        kind = vector_of(array.dtype).as_pointer()
+        size = context.get_abi_sizeof(scalar_of(array.dtype))
+        rows = []
+        for place in _each(context, builder, array, *arguments[:3]):
+            rows.append(builder.load(builder.bitcast(place, kind)))
+            rows[-1].align = size
+        places = _each(context, builder, out, *arguments[3:])
+        for place, column in zip(places, _transposed(builder, rows), strict=True):
+            builder.store(column, builder.bitcast(place, kind), align=size)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, out, types.intp, types.intp), generate
+
+
+@intrinsic
+def store_all(typing_context, array, index, vectors):
+    """Writes a tuple of vectors one behind the other. Not bound checked."""
+
+    def generate(context, builder, signature, arguments):
+        for k, vector in enumerate(cgutils.unpack_tuple(builder, arguments[2])):
+            at = builder.add(arguments[1], ir.Constant(arguments[1].type, WIDTH * k))
+            place = _place(context, builder, array, arguments[0], at)
+            builder.store(vector, place, align=context.get_abi_sizeof(scalar_of(array.dtype)))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vectors), generate
+
+
 @intrinsic
 def where(typing_context, condition, yes, no):
-    """`yes` where a condition holds, else `no`; either may be a number."""
-    element = getattr(yes, "element", yes)
-    if element != getattr(no, "element", no):
+    """`yes` where a condition holds, else `no`; one of them may be a number."""
+    element = _element_of((yes, no))
+    if element is None:
         return None
 
     def generate(context, builder, signature, arguments):
-        chosen = [
-            a if isinstance(kind, LanesType) else _spread(builder, a)
-            for kind, a in zip((yes, no), arguments[1:], strict=True)
-        ]
+        chosen = _operands(context, builder, (yes, no), arguments[1:], element)
         return builder.select(arguments[0], *chosen)
 
     return LanesType(element)(condition, yes, no), generate
@@ -213,21 +289,50 @@ def any_of(typing_context, condition):
 
 
 def _bounded(sign: str) -> Callable[..., Any]:
-    def intrinsic_for(typing_context, lanes, number):
-        def generate(context, builder, signature, arguments):
-            bound = _spread(builder, arguments[1])
-            inside = builder.fcmp_ordered(sign, arguments[0], bound)
-            return builder.select(inside, arguments[0], bound)
+    def intrinsic_for(typing_context, lanes, bound):
+        element = _element_of((lanes, bound))
 
-        return lanes(lanes, number), generate
+        def generate(context, builder, signature, arguments):
+            x, limit = _operands(context, builder, (lanes, bound), arguments, element)
+            return builder.select(builder.fcmp_ordered(sign, x, limit), x, limit)
+
+        return None if element is None else (lanes(lanes, bound), generate)
 
     return intrinsic_for
 
 
 minimum = intrinsic(_bounded("<"))
-"""The smaller of each lane and a number; NaN gives the number."""
+"""The smaller of each lane and a number or another vector's lane; where the first is NaN, the second."""
 maximum = intrinsic(_bounded(">"))
-"""The larger of each lane and a number; NaN gives the number."""
+"""The larger of each lane and a number or another vector's lane; where the first is NaN, the second."""
+
+
+def _rounded(name: str) -> Callable[..., Any]:
+    def intrinsic_for(typing_context, lanes):
+        def generate(context, builder, signature, arguments):
+            return call_each(builder, name, arguments[0])
+
+        return lanes(lanes), generate
+
+    return intrinsic_for
+
+
+sqrt = intrinsic(_rounded("sqrt"))
+"""Square root of each lane."""
+floor = intrinsic(_rounded("floor"))
+"""Each lane rounded down."""
+ceil = intrinsic(_rounded("ceil"))
+"""Each lane rounded up."""
+
+
+@intrinsic
+def multiply_add(typing_context, x, y, z):
+    """x y + z, rounded once; `x * y + z` may be rounded once or twice, by the code around it."""
+
+    def generate(context, builder, signature, arguments):
+        return call_each(builder, "fma", *arguments)
+
+    return x(x, x, x), generate
 
 
 @intrinsic
@@ -254,46 +359,3 @@ def totals(typing_context, vectors):
         return rest[0]
 
     return vectors.dtype(vectors), generate
-
-
-_EXP2 = {
-    # Least relative error on [-1/2, 1/2]: 8e-8.
-    types.float32: (
-        1.0000000716553024, 0.6931469670628859, 0.24022119720751128, 0.05550713275064405, 0.009675541502638427,
-        0.0013276471960119753,
-    ),
-    # The Taylor series to 1e-14.
-    types.float64: tuple(math.log(2) ** n / math.factorial(n) for n in range(12)),
-}  # fmt: skip
-
-
-@intrinsic
-def exp2(typing_context, lanes):
-    """2 to the power of each lane, within 3e-7 relative in float32. For exponents of normal numbers only."""
-    element = lanes.element
-    bits, mantissa = (32, 23) if element == types.float32 else (64, 52)
-    coefficients = _EXP2[element]
-
-    def generate(context, builder, signature, arguments):
-        def constant(value):
-            return _constant(element, [value] * WIDTH)
-
-        def multiply_add(x, y, z):
-            return builder.fadd(builder.fmul(x, y, flags=("contract",)), z, flags=("contract",))
-
-        whole = _call(builder, "rint", arguments[0])
-        x = builder.fsub(arguments[0], whole)
-        # Pairs of coefficients first: half the wait of going through them one by one.
-        square = builder.fmul(x, x)
-        pairs = [
-            multiply_add(constant(odd), x, constant(even))
-            for even, odd in zip(coefficients[::2], coefficients[1::2], strict=True)
-        ]
-        power = pairs.pop()
-        while pairs:
-            power = multiply_add(power, square, pairs.pop())
-        integers = ir.VectorType(ir.IntType(bits), WIDTH)
-        exponent = builder.shl(builder.fptosi(whole, integers), ir.Constant(integers, [mantissa] * WIDTH))
-        return builder.bitcast(builder.add(builder.bitcast(power, integers), exponent), power.type)
-
-    return lanes(lanes), generate

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from visdom_plugin.compute.lanes import WIDTH
 from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.render import Render
@@ -83,37 +84,46 @@ def _or_zeros(gradient: Tensor | None, shape: tuple[int, ...], like: np.ndarray)
     return np.zeros(shape, like.dtype) if gradient is None else _arrays(gradient)[0]
 
 
+def _padded(arrays: list[np.ndarray]) -> list[np.ndarray]:
+    """Rows of zeros behind arrays that are shorter than a vector: the kernels take no fewer."""
+    if len(arrays[0]) >= WIDTH:
+        return arrays
+    return [np.concatenate([x, np.zeros((WIDTH - len(x), *x.shape[1:]), x.dtype)]) for x in arrays]
+
+
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, log_scales, quaternions, opacity_logits, sh, degree, camera, width, height):
         ctx.save_for_backward(means, log_scales, quaternions, sh)
-        arrays = _arrays(means, log_scales, quaternions, opacity_logits, sh)
-        n, dtype = len(means), arrays[0].dtype
-        means2d, splats = np.empty((n, 2), dtype), np.empty((n, projection.RECORD), dtype)
-        radii, tiles = np.empty((n, 2), np.int32), np.empty(n, np.int32)
+        arrays = _padded(_arrays(means, log_scales, quaternions, opacity_logits, sh))
+        n, rows, dtype = len(means), len(arrays[0]), arrays[0].dtype
+        means2d, splats = np.empty((rows, 2), dtype), np.empty((rows, projection.RECORD), dtype)
+        radii, tiles = np.empty((rows, 2), np.int32), np.empty(rows, np.int32)
         parallel_for(
             projection.project, n, GAUSSIANS_PER_PIECE, *arrays, degree, camera, width, height,
             means2d, splats, radii, tiles,
         )  # fmt: skip
         ctx.rest = (degree, camera, width, height, splats)
         ctx.set_materialize_grads(False)
-        out = [torch.from_numpy(x) for x in (means2d, splats, radii, tiles)]
+        out = [torch.from_numpy(x[:n]) for x in (means2d, splats, radii, tiles)]
         ctx.mark_non_differentiable(*out[2:])
         return tuple(out)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, g_means2d, g_splats, *_):
-        arrays, splats = _arrays(*ctx.saved_tensors), ctx.rest[-1]
+        n, splats = len(ctx.saved_tensors[0]), ctx.rest[-1]
+        given = _or_zeros(g_means2d, (n, 2), splats), _or_zeros(g_splats, (n, projection.RECORD), splats)
+        arrays = _padded(_arrays(*ctx.saved_tensors))
         # Written whole by the kernel.
         g_means, g_log_scales, g_quaternions, g_sh = (np.empty_like(x) for x in arrays)
         g_opacity_logits = np.empty(len(g_means), g_means.dtype)
         gradients = (g_means, g_log_scales, g_quaternions, g_opacity_logits, g_sh)
         parallel_for(
-            projection.project_backward, len(g_means), GAUSSIANS_PER_PIECE, *arrays, *ctx.rest,
-            _or_zeros(g_means2d, (len(splats), 2), splats), _or_zeros(g_splats, splats.shape, splats), *gradients,
+            projection.project_backward, n, GAUSSIANS_PER_PIECE, *arrays, *ctx.rest, *_padded(list(given)),
+            *gradients,
         )  # fmt: skip
-        return *(torch.from_numpy(g) for g in gradients), None, None, None, None
+        return *(torch.from_numpy(g[:n]) for g in gradients), None, None, None, None
 
 
 class _Blend(torch.autograd.Function):

@@ -12,9 +12,10 @@ import numpy as np
 
 from visdom_plugin.compute import lanes
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.lanes import any_of, exp2, fill, load, maximum, minimum, store, where
+from visdom_plugin.compute.lane_math import exp2
+from visdom_plugin.compute.lanes import any_of, fill, load, maximum, minimum, store, where
 from visdom_plugin.splat.cpu.projection import LOG2_ALPHA_MIN, LOG2_E, RECORD
-from visdom_plugin.splat.cpu.tiles import TILE
+from visdom_plugin.splat.cpu.tiles import TILE, scratch
 
 assert TILE == lanes.WIDTH == RECORD
 
@@ -31,14 +32,6 @@ the pixel to the mean: sums of g, g dx, g dy, g dx^2, g dx dy, g dy^2, gradients
 T, END, RED, GREEN, BLUE, Z, BEHIND, PLANES = (TILE * plane for plane in range(8))
 BATCH = 16
 """Gaussians that are fetched at once, and after which rows that have ended are looked for."""
-
-
-@kernel(error_model="numpy")
-def _scratch(like, count):
-    """An array of `count` numbers that begins at a cache line: a vector across two takes twice as long."""
-    room = np.empty(count + 16, like.dtype)
-    start = (-room.ctypes.data % 64) // like.itemsize
-    return room[start : start + count]
 
 
 @kernel(error_model="numpy")
@@ -72,13 +65,13 @@ def blend(
     height, width = alpha.shape
     real = alpha.dtype.type
     zero, one, half = real(0), real(1), real(0.5)
-    s, batch = _scratch(alpha, TILE * PLANES), _scratch(alpha, BATCH * RECORD)
+    s, batch = scratch(alpha, TILE * PLANES), scratch(alpha, BATCH * RECORD)
     nothing = fill(zero)
     for tile in range(begin, end):
         top, left = (tile // columns) * TILE, (tile % columns) * TILE
         xs = lanes.count_up(real(left) + half)
         for p in range(0, TILE * PLANES, PLANES):
-            store(s, p + T, where(xs < real(width if top + p // PLANES < height else 0), one, -one))
+            store(s, p + T, where(xs < real(width if top + p // PLANES < height else 0), fill(one), -one))
             store(s, p + END, fill(real(np.inf)))
             for plane in range(RED, BEHIND, TILE):
                 store(s, p + plane, nothing)
@@ -144,7 +137,7 @@ def blend_backward(
     height, width = alpha.shape
     real = alpha.dtype.type
     zero, one, half = real(0), real(1), real(0.5)
-    s, batch = _scratch(alpha, TILE * PLANES), _scratch(alpha, BATCH * RECORD)
+    s, batch = scratch(alpha, TILE * PLANES), scratch(alpha, BATCH * RECORD)
     nothing = fill(zero)
     for tile in range(begin, end):
         start, finish = starts[tile], starts[tile] + reached[tile]

@@ -12,18 +12,35 @@ Gaussians not drawn:
   12: tau = 2 ln(255 opacity), the squared radius of that isoline
   13: log2 of the opacity
 `camera` is (20,): world-to-camera rotation by rows, translation, fx, fy, cx, cy, camera centre, near plane.
+
+16 Gaussians are one vector of each number, and there must be 16 at least. Where N is no multiple of 16 the last
+vector begins earlier; what it shares with the one before comes out the same.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from visdom_plugin.compute.kernels import kernel
-from visdom_plugin.compute.lanes import fill, store
-from visdom_plugin.geometry.harmonics import basis, basis_gradient
-from visdom_plugin.splat.cpu.tiles import count_tiles
+from visdom_plugin.compute.lane_math import exp, log2
+from visdom_plugin.compute.lanes import (
+    WIDTH,
+    any_of,
+    ceil,
+    fill,
+    load,
+    maximum,
+    minimum,
+    put,
+    sqrt,
+    store,
+    store_all,
+    take,
+    transpose,
+    where,
+)
+from visdom_plugin.geometry.harmonics import C0, higher, higher_gradient
+from visdom_plugin.splat.cpu.tiles import count_tiles, scratch
 
 DILATION = 0.3  # px^2, 3DGS's low-pass filter
 ALPHA_MIN = 1 / 255
@@ -32,46 +49,97 @@ FRUSTUM_MARGIN = 0.3
 RECORD = 16
 """Numbers per Gaussian in `splats`."""
 LOG2_E = 1 / math.log(2)
+LARGEST = 80.0
+"""Logarithm of a standard deviation beyond which its square overflows."""
+
+assert RECORD == WIDTH
+
+# A kernel's scratch array: vectors of the axes in camera coordinates and their gradients, by rows; records and
+# their gradients, by fields; basis functions, and their part in the loss; harmonics, by numbers of a Gaussian.
+AXES, G_AXES, FIELDS, G_FIELDS, BASIS, WEIGHTS, SH = (WIDTH * plane for plane in (0, 9, 18, 34, 50, 66, 82))
+PLANES = 130
 
 
-@kernel(error_model="numpy")
-def _unit_quaternion(q):
-    length = max(math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]), q.dtype.type(1e-12))
-    return q[0] / length, q[1] / length, q[2] / length, q[3] / length, length
+@kernel(fast=True)
+def _turned(camera, row, x, y, z):
+    """A row of the camera's rotation times a vector."""
+    return camera[row] * x + camera[row + 1] * y + camera[row + 2] * z
 
 
-@kernel(error_model="numpy")
-def _axes(i, log_scales, quaternions, camera, m, s):
-    """Writes the Gaussian's axes in camera coordinates (columns of m) and its standard deviations s."""
-    w, x, y, z, _ = _unit_quaternion(quaternions[i])
-    one, two = m.dtype.type(1), m.dtype.type(2)
-    r00, r01, r02 = one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)
-    r10, r11, r12 = two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)
-    r20, r21, r22 = two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)
+@kernel(fast=True)
+def _camera_point(i, means, camera):
+    """World coordinates of 16 means and camera coordinates."""
+    mx, my, mz = take(means, 3 * i, 3), take(means, 3 * i + 1, 3), take(means, 3 * i + 2, 3)
+    x, y = _turned(camera, 0, mx, my, mz) + camera[9], _turned(camera, 3, mx, my, mz) + camera[10]
+    return mx, my, mz, x, y, _turned(camera, 6, mx, my, mz) + camera[11]
+
+
+@kernel(fast=True)
+def _unit_quaternion(i, quaternions):
+    w, x = take(quaternions, 4 * i, 4), take(quaternions, 4 * i + 1, 4)
+    y, z = take(quaternions, 4 * i + 2, 4), take(quaternions, 4 * i + 3, 4)
+    length = maximum(sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    return w / length, x / length, y / length, z / length, length
+
+
+@kernel(fast=True)
+def _put_axis(s, k, camera, x, y, z):
     for row in range(3):
-        v0, v1, v2 = camera[3 * row], camera[3 * row + 1], camera[3 * row + 2]
-        m[row, 0] = v0 * r00 + v1 * r10 + v2 * r20
-        m[row, 1] = v0 * r01 + v1 * r11 + v2 * r21
-        m[row, 2] = v0 * r02 + v1 * r12 + v2 * r22
-    for axis in range(3):
-        s[axis] = math.exp(log_scales[i, axis])
+        store(s, AXES + WIDTH * (3 * row + k), _turned(camera, 3 * row, x, y, z))
 
 
-@kernel(error_model="numpy")
-def _clamped(ratio, focal, centre, size):
-    """The ratio x/z kept where the Jacobian is trusted, and whether it was inside."""
-    real = type(ratio)
-    margin = real(FRUSTUM_MARGIN * 0.5) * size / focal
-    low, high = -centre / focal - margin, (size - centre) / focal + margin
-    return min(high, max(low, ratio)), low <= ratio <= high
+@kernel(fast=True)
+def _put_axes(i, quaternions, camera, s):
+    """Writes the Gaussians' axes in camera coordinates."""
+    w, x, y, z, _ = _unit_quaternion(i, quaternions)
+    _put_axis(s, 0, camera, 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+    _put_axis(s, 1, camera, 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
+    _put_axis(s, 2, camera, 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
 
 
-@kernel(error_model="numpy")
-def _camera_point(mean, camera):
-    x = camera[0] * mean[0] + camera[1] * mean[1] + camera[2] * mean[2] + camera[9]
-    y = camera[3] * mean[0] + camera[4] * mean[1] + camera[5] * mean[2] + camera[10]
-    z = camera[6] * mean[0] + camera[7] * mean[1] + camera[8] * mean[2] + camera[11]
-    return x, y, z
+@kernel(fast=True)
+def _axis(s, k):
+    """x, y, z of axis k."""
+    return (
+        load(s, AXES + WIDTH * k), load(s, AXES + WIDTH * (3 + k)), load(s, AXES + WIDTH * (6 + k))
+    )  # fmt: skip
+
+
+@kernel(fast=True)
+def _limits(focal, centre, size):
+    """The least and the largest ratio x/z at which the Jacobian is trusted."""
+    margin = type(focal)(FRUSTUM_MARGIN * 0.5) * size / focal
+    return -centre / focal - margin, (size - centre) / focal + margin
+
+
+@kernel(fast=True)
+def _direction(mx, my, mz, camera):
+    """Unit vectors from the camera's centre to the means, and their distances."""
+    dx, dy, dz = mx - camera[16], my - camera[17], mz - camera[18]
+    length = maximum(sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
+    return dx / length, dy / length, dz / length, length
+
+
+@kernel(fast=True)
+def _put_basis(degree, x, y, z, s):
+    """Writes basis functions, zero beyond the degree."""
+    none = x * 0
+    store(s, BASIS, none + C0)
+    store_all(s, BASIS + WIDTH, higher(x, y, z))
+    for k in range((degree + 1) * (degree + 1), WIDTH):
+        store(s, BASIS + WIDTH * k, none)
+
+
+@kernel(fast=True)
+def _fetch_sh(i, count, sh, s):
+    """Writes the first `count` harmonics of 16 Gaussians, by numbers."""
+    numbers = 3 * sh.shape[1]
+    if numbers == 3 * WIDTH:
+        for part in range(0, 3 * count, WIDTH):
+            transpose(sh, i * numbers + part, numbers, s, SH + WIDTH * part, WIDTH)
+    else:
+        for k in range(3 * count):
+            store(s, SH + WIDTH * k, take(sh, i * numbers + k, numbers))
 
 
 @kernel(error_model="numpy")
@@ -84,60 +152,72 @@ def project(
     `radii` (N, 2) are gsplat's, in whole pixels, and `tiles` (N,) how many tiles of the image each meets.
     """
     real = means.dtype.type
-    one, zero = real(1), real(0)
     fx, fy, cx, cy, near = camera[12], camera[13], camera[14], camera[15], camera[19]
-    m, s, values = np.empty((3, 3), means.dtype), np.empty(3, means.dtype), np.empty(16, means.dtype)
+    low_x, high_x = _limits(fx, cx, real(width))
+    low_y, high_y = _limits(fy, cy, real(height))
+    s = scratch(means, WIDTH * PLANES)
+    zero = fill(real(0))
     n_basis = (degree + 1) * (degree + 1)
-    for i in range(begin, end):
-        store(splats, i * RECORD, fill(zero))
-        means2d[i, 0], means2d[i, 1] = zero, zero
-        radii[i, 0], radii[i, 1], tiles[i] = 0, 0, 0
-        x, y, z = _camera_point(means[i], camera)
-        opacity = one / (one + math.exp(-opacity_logits[i]))
+    for first in range(begin, end, WIDTH):
+        i = min(first, len(means) - WIDTH)
+        mx, my, mz, x, y, z = _camera_point(i, means, camera)
+        logit = load(opacity_logits, i)
+        opacity = 1 / (1 + exp(0 - logit))
         # Written so that NaN fails.
-        if not (z >= near and opacity >= real(ALPHA_MIN)):
-            continue
-        _axes(i, log_scales, quaternions, camera, m, s)
-        tx, _ = _clamped(x / z, fx, cx, real(width))
-        ty, _ = _clamped(y / z, fy, cy, real(height))
-        jx, jy, jxz, jyz = fx / z, fy / z, -fx * tx / z, -fy * ty / z
-        xx, xy, yy = real(DILATION), zero, real(DILATION)
-        for k in range(3):
-            u = (jx * m[0, k] + jxz * m[2, k]) * s[k]
-            v = (jy * m[1, k] + jyz * m[2, k]) * s[k]
-            xx += u * u
-            xy += u * v
-            yy += v * v
-        determinant = xx * yy - xy * xy
-        tau = real(2) * math.log(opacity / real(ALPHA_MIN))
-        # gsplat's integer radii, for densification; the finer extents decide what is drawn.
-        reach = min(real(3.33), math.sqrt(tau))
-        radius_x, radius_y = math.ceil(reach * math.sqrt(xx)), math.ceil(reach * math.sqrt(yy))
-        u, v = fx * x / z + cx, fy * y / z + cy
-        drawn = determinant > zero and u + radius_x > zero and u - radius_x < real(width)
-        if not (drawn and v + radius_y > zero and v - radius_y < real(height) and radius_x < real(1e9)):
-            continue
-        means2d[i, 0], means2d[i, 1] = u, v
-        splats[i, 0], splats[i, 1], splats[i, 2] = yy / determinant, -xy / determinant, xx / determinant
-        splats[i, 3], splats[i, 7] = opacity, z
-        radii[i, 0], radii[i, 1] = np.int32(radius_x), np.int32(radius_y)
-        splats[i, 8], splats[i, 9] = u, v
-        # A hundredth of a pixel more: rounding must never cut what the test of alpha would keep.
-        splats[i, 10] = math.sqrt(tau * xx) + real(0.01)
-        splats[i, 11] = math.sqrt(tau * yy) + real(0.01)
-        splats[i, 12] = tau * real(1.001) + real(0.001)
-        splats[i, 13] = real(0.5 * LOG2_E) * tau + real(LOG2_ALPHA_MIN)
-        tiles[i] = count_tiles(splats, i, width, height)
-
-        dx, dy, dz = means[i, 0] - camera[16], means[i, 1] - camera[17], means[i, 2] - camera[18]
-        length = max(math.sqrt(dx * dx + dy * dy + dz * dz), real(1e-12))
-        basis(degree, dx / length, dy / length, dz / length, values)
-        red, green, blue = real(0.5), real(0.5), real(0.5)
-        for k in range(n_basis):
-            red += values[k] * sh[i, k, 0]
-            green += values[k] * sh[i, k, 1]
-            blue += values[k] * sh[i, k, 2]
-        splats[i, 4], splats[i, 5], splats[i, 6] = max(red, zero), max(green, zero), max(blue, zero)
+        drawn = (z >= near) & (opacity >= real(ALPHA_MIN)) & (logit > -LARGEST)
+        for field in range(RECORD):
+            store(s, FIELDS + WIDTH * field, zero)
+        u, v, radius_x, radius_y, count = zero, zero, zero, zero, zero
+        if any_of(drawn):
+            _put_axes(i, quaternions, camera, s)
+            jx, jy = fx / z, fy / z
+            jxz = 0 - jx * minimum(maximum(x / z, low_x), high_x)
+            jyz = 0 - jy * minimum(maximum(y / z, low_y), high_y)
+            xx, xy, yy = zero + DILATION, zero, zero + DILATION
+            for k in range(3):
+                log_scale = take(log_scales, 3 * i + k, 3)
+                drawn = drawn & (log_scale < LARGEST)
+                scale = exp(log_scale)
+                ax, ay, az = _axis(s, k)
+                tu, tv = (jx * ax + jxz * az) * scale, (jy * ay + jyz * az) * scale
+                xx, xy, yy = xx + tu * tu, xy + tu * tv, yy + tv * tv
+            determinant = xx * yy - xy * xy
+            # A little above the least opacity, log2 may be a rounding error below 0.
+            tau = maximum((log2(opacity) - LOG2_ALPHA_MIN) * (2 * math.log(2)), 0)
+            # gsplat's integer radii, for densification; the finer extents decide what is drawn.
+            reach = minimum(sqrt(tau), 3.33)
+            radius_x, radius_y = ceil(reach * sqrt(xx)), ceil(reach * sqrt(yy))
+            u, v = fx * x / z + cx, fy * y / z + cy
+            drawn = drawn & (determinant > 0) & (radius_x < 1e9) & (radius_y < 1e9)
+            drawn = drawn & (u + radius_x > 0) & (u - radius_x < width)
+            drawn = drawn & (v + radius_y > 0) & (v - radius_y < height)
+        if any_of(drawn):
+            dx, dy, dz, _ = _direction(mx, my, mz, camera)
+            _put_basis(degree, dx, dy, dz, s)
+            _fetch_sh(i, n_basis, sh, s)
+            red, green, blue = zero + 0.5, zero + 0.5, zero + 0.5
+            for k in range(n_basis):
+                value = load(s, BASIS + WIDTH * k)
+                red = red + value * load(s, SH + WIDTH * 3 * k)
+                green = green + value * load(s, SH + WIDTH * (3 * k + 1))
+                blue = blue + value * load(s, SH + WIDTH * (3 * k + 2))
+            # A hundredth of a pixel more: rounding must never cut what the test of alpha would keep.
+            fields = (
+                yy / determinant, (0 - xy) / determinant, xx / determinant, opacity,
+                maximum(red, 0), maximum(green, 0), maximum(blue, 0), z,
+                u, v, sqrt(tau * xx) + 0.01, sqrt(tau * yy) + 0.01,
+                tau * 1.001 + 0.001, tau * (0.5 * LOG2_E) + LOG2_ALPHA_MIN,
+            )  # fmt: skip
+            store_all(s, FIELDS, fields)
+            for k in range(len(fields)):
+                store(s, FIELDS + WIDTH * k, where(drawn, load(s, FIELDS + WIDTH * k), 0))
+            count = count_tiles(s, FIELDS, width, height)
+        transpose(s, FIELDS, WIDTH, splats, RECORD * i, RECORD)
+        put(means2d, 2 * i, 2, where(drawn, u, 0))
+        put(means2d, 2 * i + 1, 2, where(drawn, v, 0))
+        put(radii, 2 * i, 2, where(drawn, radius_x, 0))
+        put(radii, 2 * i + 1, 2, where(drawn, radius_y, 0))
+        put(tiles, i, 1, count)
 
 
 @kernel(error_model="numpy")
@@ -147,105 +227,118 @@ def project_backward(
 ):  # fmt: skip
     """Writes the gradients of Gaussians begin .. end - 1 from those of means2d and splats."""
     real = means.dtype.type
-    one, zero, half, two = real(1), real(0), real(0.5), real(2)
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
-    m, s = np.empty((3, 3), means.dtype), np.empty(3, means.dtype)
-    g_m, g_r = np.empty((3, 3), means.dtype), np.empty((3, 3), means.dtype)
-    values, slopes = np.empty(16, means.dtype), np.empty((16, 3), means.dtype)
-    n_basis = (degree + 1) * (degree + 1)
-    for i in range(begin, end):
-        if splats[i, 12] == zero:
-            for k in range(3):
-                g_means[i, k], g_log_scales[i, k] = zero, zero
-            for k in range(4):
-                g_quaternions[i, k] = zero
-            g_opacity_logits[i] = zero
-            for k in range(sh.shape[1]):
-                g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = zero, zero, zero
-            continue
-        x, y, z = _camera_point(means[i], camera)
-        _axes(i, log_scales, quaternions, camera, m, s)
-        tx, inside_x = _clamped(x / z, fx, cx, real(width))
-        ty, inside_y = _clamped(y / z, fy, cy, real(height))
-        jx, jy, jxz, jyz = fx / z, fy / z, -fx * tx / z, -fy * ty / z
+    low_x, high_x = _limits(fx, cx, real(width))
+    low_y, high_y = _limits(fy, cy, real(height))
+    s = scratch(means, WIDTH * PLANES)
+    zero = fill(real(0))
+    numbers = 3 * sh.shape[1]
+    for first in range(begin, end, WIDTH):
+        i = min(first, len(means) - WIDTH)
+        transpose(splats, RECORD * i, RECORD, s, FIELDS, WIDTH)
+        transpose(g_splats, RECORD * i, RECORD, s, G_FIELDS, WIDTH)
+        drawn = load(s, FIELDS + WIDTH * 12) > 0
+        mx, my, mz, x, y, z = _camera_point(i, means, camera)
+        _put_axes(i, quaternions, camera, s)
+        ratio_x, ratio_y = x / z, y / z
+        tx = minimum(maximum(ratio_x, low_x), high_x)
+        ty = minimum(maximum(ratio_y, low_y), high_y)
+        jx, jy = fx / z, fy / z
+        jxz, jyz = 0 - jx * tx, 0 - jy * ty
 
         # conic = cov^-1, hence g_cov = -conic g_conic conic; b stands for two equal entries.
-        a, b, c = splats[i, 0], splats[i, 1], splats[i, 2]
-        ga, gb, gc = g_splats[i, 0], half * g_splats[i, 1], g_splats[i, 2]
+        a, b, c = load(s, FIELDS), load(s, FIELDS + WIDTH), load(s, FIELDS + WIDTH * 2)
+        ga, gb, gc = load(s, G_FIELDS), 0.5 * load(s, G_FIELDS + WIDTH), load(s, G_FIELDS + WIDTH * 2)
         p00, p01, p10, p11 = a * ga + b * gb, a * gb + b * gc, b * ga + c * gb, b * gb + c * gc
-        gxx, gxy, gyy = -(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)
+        gxx, gxy, gyy = 0 - (p00 * a + p01 * b), 0 - (p00 * b + p01 * c), 0 - (p10 * b + p11 * c)
 
         # cov = sum_k t_k t_k^T + 0.3 I with t_k = s_k J m_k.
         g_jx, g_jy, g_jxz, g_jyz = zero, zero, zero, zero
         for k in range(3):
-            u = jx * m[0, k] + jxz * m[2, k]
-            v = jy * m[1, k] + jyz * m[2, k]
-            gu = two * (gxx * u + gxy * v) * s[k]
-            gv = two * (gxy * u + gyy * v) * s[k]
-            g_log_scales[i, k] = (gu * u + gv * v) * s[k]
-            gu, gv = gu * s[k], gv * s[k]
-            g_jx += gu * m[0, k]
-            g_jy += gv * m[1, k]
-            g_jxz += gu * m[2, k]
-            g_jyz += gv * m[2, k]
-            g_m[0, k], g_m[1, k], g_m[2, k] = jx * gu, jy * gv, jxz * gu + jyz * gv
-
-        g_u, g_v = g_means2d[i, 0], g_means2d[i, 1]
-        gx, gy = g_u * jx, g_v * jy
-        gz = g_splats[i, 7] - (g_u * jx * x + g_v * jy * y + g_jx * jx + g_jy * jy) / z
-        # jxz = -fx tx / z, where tx = x / z inside the frustum and constant outside.
-        gz -= (g_jxz * jxz + g_jyz * jyz) / z
-        if inside_x:
-            gx -= g_jxz * jx / z
-            gz += g_jxz * jx * tx / z
-        if inside_y:
-            gy -= g_jyz * jy / z
-            gz += g_jyz * jy * ty / z
-        for k in range(3):
-            g_means[i, k] = camera[k] * gx + camera[3 + k] * gy + camera[6 + k] * gz
+            ax, ay, az = _axis(s, k)
+            scale = exp(take(log_scales, 3 * i + k, 3))
+            u, v = jx * ax + jxz * az, jy * ay + jyz * az
+            gu, gv = 2 * (gxx * u + gxy * v) * scale, 2 * (gxy * u + gyy * v) * scale
+            put(g_log_scales, 3 * i + k, 3, where(drawn, (gu * u + gv * v) * scale, 0))
+            gu, gv = gu * scale, gv * scale
+            g_jx, g_jy = g_jx + gu * ax, g_jy + gv * ay
+            g_jxz, g_jyz = g_jxz + gu * az, g_jyz + gv * az
+            gx, gy, gz = jx * gu, jy * gv, jxz * gu + jyz * gv
             for j in range(3):
-                g_r[j, k] = camera[j] * g_m[0, k] + camera[3 + j] * g_m[1, k] + camera[6 + j] * g_m[2, k]
-        _rotation_backward(quaternions[i], g_r, g_quaternions[i])
-        opacity = splats[i, 3]
-        g_opacity_logits[i] = g_splats[i, 3] * opacity * (one - opacity)
+                store(
+                    s, G_AXES + WIDTH * (3 * j + k), camera[j] * gx + camera[3 + j] * gy + camera[6 + j] * gz
+                )
+        _rotation_backward(i, quaternions, s, drawn, g_quaternions)
 
-        red = g_splats[i, 4] if splats[i, 4] > zero else zero
-        green = g_splats[i, 5] if splats[i, 5] > zero else zero
-        blue = g_splats[i, 6] if splats[i, 6] > zero else zero
-        dx, dy, dz = means[i, 0] - camera[16], means[i, 1] - camera[17], means[i, 2] - camera[18]
-        length = max(math.sqrt(dx * dx + dy * dy + dz * dz), real(1e-12))
-        dx, dy, dz = dx / length, dy / length, dz / length
-        basis(degree, dx, dy, dz, values)
-        for k in range(n_basis):
-            g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = values[k] * red, values[k] * green, values[k] * blue
-        for k in range(n_basis, sh.shape[1]):
-            g_sh[i, k, 0], g_sh[i, k, 1], g_sh[i, k, 2] = zero, zero, zero
-        if degree > 0:
-            basis_gradient(degree, dx, dy, dz, slopes)
-            gx, gy, gz = zero, zero, zero
-            for k in range(1, n_basis):
-                weight = sh[i, k, 0] * red + sh[i, k, 1] * green + sh[i, k, 2] * blue
-                gx += weight * slopes[k, 0]
-                gy += weight * slopes[k, 1]
-                gz += weight * slopes[k, 2]
-            along = gx * dx + gy * dy + gz * dz
-            g_means[i, 0] += (gx - along * dx) / length
-            g_means[i, 1] += (gy - along * dy) / length
-            g_means[i, 2] += (gz - along * dz) / length
+        g_u, g_v = take(g_means2d, 2 * i, 2), take(g_means2d, 2 * i + 1, 2)
+        gx, gy = g_u * jx, g_v * jy
+        gz = load(s, G_FIELDS + WIDTH * 7) - (g_u * jx * x + g_v * jy * y + g_jx * jx + g_jy * jy) / z
+        # jxz = -fx tx / z, where tx = x / z inside the frustum and constant outside.
+        gz = gz - (g_jxz * jxz + g_jyz * jyz) / z
+        slope_x = where((low_x <= ratio_x) & (ratio_x <= high_x), g_jxz * jx / z, 0)
+        slope_y = where((low_y <= ratio_y) & (ratio_y <= high_y), g_jyz * jy / z, 0)
+        gx, gy, gz = gx - slope_x, gy - slope_y, gz + slope_x * tx + slope_y * ty
+        opacity = load(s, FIELDS + WIDTH * 3)
+        g_opacity = load(s, G_FIELDS + WIDTH * 3) * opacity * (1 - opacity)
+        put(g_opacity_logits, i, 1, where(drawn, g_opacity, 0))
+
+        dx, dy, dz, length = _direction(mx, my, mz, camera)
+        _put_basis(degree, dx, dy, dz, s)
+        _fetch_sh(i, sh.shape[1], sh, s)
+        # The colour is clamped at 0, and that of what is not drawn is 0.
+        red = where(load(s, FIELDS + WIDTH * 4) > 0, load(s, G_FIELDS + WIDTH * 4), 0)
+        green = where(load(s, FIELDS + WIDTH * 5) > 0, load(s, G_FIELDS + WIDTH * 5), 0)
+        blue = where(load(s, FIELDS + WIDTH * 6) > 0, load(s, G_FIELDS + WIDTH * 6), 0)
+        for k in range(WIDTH):
+            store(s, WEIGHTS + WIDTH * k, zero)
+        for k in range(sh.shape[1]):
+            value, at = where(drawn, load(s, BASIS + WIDTH * k), 0), SH + WIDTH * 3 * k
+            if k < (degree + 1) * (degree + 1):
+                weight = load(s, at) * red + load(s, at + WIDTH) * green + load(s, at + 2 * WIDTH) * blue
+                store(s, WEIGHTS + WIDTH * k, weight)
+            store(s, at, value * red)
+            store(s, at + WIDTH, value * green)
+            store(s, at + 2 * WIDTH, value * blue)
+        if numbers == 3 * WIDTH:
+            for part in range(0, numbers, WIDTH):
+                transpose(s, SH + WIDTH * part, WIDTH, g_sh, i * numbers + part, numbers)
+        else:
+            for k in range(numbers):
+                put(g_sh, i * numbers + k, numbers, load(s, SH + WIDTH * k))
+        sx, sy, sz = _slopes(dx, dy, dz, s)
+        along = sx * dx + sy * dy + sz * dz
+        sx, sy, sz = (sx - along * dx) / length, (sy - along * dy) / length, (sz - along * dz) / length
+        put(g_means, 3 * i, 3, where(drawn, camera[0] * gx + camera[3] * gy + camera[6] * gz + sx, 0))
+        put(g_means, 3 * i + 1, 3, where(drawn, camera[1] * gx + camera[4] * gy + camera[7] * gz + sy, 0))
+        put(g_means, 3 * i + 2, 3, where(drawn, camera[2] * gx + camera[5] * gy + camera[8] * gz + sz, 0))
 
 
-@kernel(error_model="numpy")
-def _rotation_backward(quaternion, g, out):
-    """Gradient of a quaternion of any length from that of its rotation matrix, g (3, 3)."""
-    two = g.dtype.type(2)
-    w, x, y, z, length = _unit_quaternion(quaternion)
-    gw = two * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
-    gx = two * (y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]))
-    gx -= two * two * x * (g[1, 1] + g[2, 2])
-    gy = two * (x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]))
-    gy -= two * two * y * (g[0, 0] + g[2, 2])
-    gz = two * (x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) + w * (g[1, 0] - g[0, 1]))
-    gz -= two * two * z * (g[0, 0] + g[1, 1])
+@kernel(fast=True)
+def _slopes(x, y, z, s):
+    """Derivatives by the direction of the colours' part of the loss."""
+    return higher_gradient(
+        x, y, z,
+        load(s, WEIGHTS + WIDTH), load(s, WEIGHTS + 2 * WIDTH), load(s, WEIGHTS + 3 * WIDTH),
+        load(s, WEIGHTS + 4 * WIDTH), load(s, WEIGHTS + 5 * WIDTH), load(s, WEIGHTS + 6 * WIDTH),
+        load(s, WEIGHTS + 7 * WIDTH), load(s, WEIGHTS + 8 * WIDTH), load(s, WEIGHTS + 9 * WIDTH),
+        load(s, WEIGHTS + 10 * WIDTH), load(s, WEIGHTS + 11 * WIDTH), load(s, WEIGHTS + 12 * WIDTH),
+        load(s, WEIGHTS + 13 * WIDTH), load(s, WEIGHTS + 14 * WIDTH), load(s, WEIGHTS + 15 * WIDTH),
+    )  # fmt: skip
+
+
+@kernel(fast=True)
+def _rotation_backward(i, quaternions, s, drawn, g_quaternions):
+    """Writes the gradient of quaternions of any length from that of their rotation matrices."""
+    w, x, y, z, length = _unit_quaternion(i, quaternions)
+    g00, g01, g02 = load(s, G_AXES), load(s, G_AXES + WIDTH), load(s, G_AXES + 2 * WIDTH)
+    g10, g11, g12 = load(s, G_AXES + 3 * WIDTH), load(s, G_AXES + 4 * WIDTH), load(s, G_AXES + 5 * WIDTH)
+    g20, g21, g22 = load(s, G_AXES + 6 * WIDTH), load(s, G_AXES + 7 * WIDTH), load(s, G_AXES + 8 * WIDTH)
+    gw = 2 * (x * (g21 - g12) + y * (g02 - g20) + z * (g10 - g01))
+    gx = 2 * (y * (g01 + g10) + z * (g02 + g20) + w * (g21 - g12)) - 4 * x * (g11 + g22)
+    gy = 2 * (x * (g01 + g10) + z * (g12 + g21) + w * (g02 - g20)) - 4 * y * (g00 + g22)
+    gz = 2 * (x * (g02 + g20) + y * (g12 + g21) + w * (g10 - g01)) - 4 * z * (g00 + g11)
     along = gw * w + gx * x + gy * y + gz * z
-    out[0], out[1] = (gw - along * w) / length, (gx - along * x) / length
-    out[2], out[3] = (gy - along * y) / length, (gz - along * z) / length
+    put(g_quaternions, 4 * i, 4, where(drawn, (gw - along * w) / length, 0))
+    put(g_quaternions, 4 * i + 1, 4, where(drawn, (gx - along * x) / length, 0))
+    put(g_quaternions, 4 * i + 2, 4, where(drawn, (gy - along * y) / length, 0))
+    put(g_quaternions, 4 * i + 3, 4, where(drawn, (gz - along * z) / length, 0))

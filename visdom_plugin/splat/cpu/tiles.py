@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from visdom_plugin.compute.kernels import kernel
+from visdom_plugin.compute.lanes import (
+    WIDTH,
+    any_of,
+    ceil,
+    floor,
+    load,
+    maximum,
+    minimum,
+    multiply_add,
+    sqrt,
+    store,
+    transpose,
+    where,
+)
 from visdom_plugin.compute.parallel import parallel_for
 
 TILE = 16
@@ -83,48 +95,65 @@ def _radix_order(keys, digits):
     return order
 
 
-@kernel(fast=True)
-def _columns(splats, i, width):
-    """Columns of tiles that a Gaussian's box meets: first and one past the last."""
-    real = splats.dtype.type
-    u, extent, unit = splats[i, 8] - real(0.5), splats[i, 10], real(1 / TILE)
-    first, last = np.floor((u - extent) * unit), np.floor((u + extent) * unit)
-    return int(max(first, real(0))), int(min(last, real((width - 1) // TILE))) + 1
+@kernel(error_model="numpy")
+def scratch(like, count):
+    """An array of `count` numbers that begins at a cache line: a vector across two takes twice as long."""
+    room = np.empty(count + 16, like.dtype)
+    start = (-room.ctypes.data % 64) // like.itemsize
+    return room[start : start + count]
 
 
 @kernel(fast=True)
-def _lines(splats, i, column, height):
-    """Pixel rows that the ellipse a dx^2 + 2 b dx dy + c dy^2 <= tau meets in a column of tiles: first and last.
+def _columns(s, at, width):
+    """Columns of tiles that the boxes of 16 Gaussians meet: first and last, by their fields from `at` on.
 
-    Its upper edge over x is concave, so the highest point in the column is at the ellipse's own highest point or
-    the nearest x to it; the lowest likewise.
+    Those not drawn meet none.
     """
-    real = splats.dtype.type
-    a, b, c, tau = splats[i, 0], splats[i, 1], splats[i, 2], splats[i, 12]
-    half_width, half_height = splats[i, 10], splats[i, 11]
-    left = real(column * TILE) + real(0.5) - splats[i, 8]
-    right = left + real(TILE - 1)
+    u, extent = load(s, at + 8 * WIDTH) - 0.5, load(s, at + 10 * WIDTH)
+    first, last = floor((u - extent) * (1 / TILE)), floor((u + extent) * (1 / TILE))
+    last = minimum(last, (width - 1) // TILE)
+    return maximum(first, 0), where(load(s, at + 12 * WIDTH) > 0, last, -1)
+
+
+@kernel(fast=True)
+def _lines(s, at, column, height):
+    """Pixel rows that the ellipses a dx^2 + 2 b dx dy + c dy^2 <= tau meet in a column of tiles: first and last.
+
+    An ellipse's upper edge over x is concave, so the highest point in the column is at its own highest point or
+    the nearest x to it; the lowest likewise.
+
+    No product is added to anything but by multiply_add: two kernels must find the same rows.
+    """
+    a, b, c = load(s, at), load(s, at + WIDTH), load(s, at + 2 * WIDTH)
+    half_width, half_height, tau = (
+        load(s, at + 10 * WIDTH),
+        load(s, at + 11 * WIDTH),
+        load(s, at + 12 * WIDTH),
+    )
+    left = column * TILE - (load(s, at + 8 * WIDTH) - 0.5)
+    right = left + (TILE - 1)
     lean, tilt, squared = b / a * half_height, b / c, tau / c
     flat = squared / (half_width * half_width)
-    high, low = min(max(-lean, left), right), min(max(lean, left), right)
+    high, low = minimum(maximum(0 - lean, left), right), minimum(maximum(lean, left), right)
+    up = sqrt(maximum((half_width - high) * (half_width + high) * flat, 0))
+    down = sqrt(maximum((half_width - low) * (half_width + low) * flat, 0))
     # A fiftieth of a pixel more: rounding must never cut what the test of alpha would keep.
-    up = math.sqrt(max(squared - flat * high * high, real(0))) - tilt * high + real(0.02)
-    down = math.sqrt(max(squared - flat * low * low, real(0))) + tilt * low + real(0.02)
-    v = splats[i, 9] - real(0.5)
-    first = int(np.ceil(max(v - down, real(0))))
-    last = int(np.floor(max(min(v + up, real(height - 1)), real(-1))))
-    return first, (last if left <= half_width and right >= -half_width else -1)
+    up, down = multiply_add(0 - tilt, high, up) + 0.02, multiply_add(tilt, low, down) + 0.02
+    v = load(s, at + 9 * WIDTH) - 0.5
+    first, last = ceil(maximum(v - down, 0)), floor(minimum(v + up, height - 1))
+    return first, where((left <= half_width) & (right >= 0 - half_width), last, -1)
 
 
 @kernel(fast=True)
-def count_tiles(splats, i, width, height):
-    """How many tiles of the image a Gaussian meets."""
-    total = 0
-    first, end = _columns(splats, i, width)
-    for column in range(first, end):
-        low, high = _lines(splats, i, column, height)
-        if low <= high:
-            total += high // TILE - low // TILE + 1
+def count_tiles(s, at, width, height):
+    """How many tiles of the image 16 Gaussians meet, by their fields from `at` on."""
+    column, last = _columns(s, at, width)
+    total = column * 0
+    while any_of(column <= last):
+        low, high = _lines(s, at, column, height)
+        here = floor(high * (1 / TILE)) - floor(low * (1 / TILE)) + 1
+        total = total + where((column <= last) & (low <= high), here, 0)
+        column = column + 1
     return total
 
 
@@ -132,20 +161,39 @@ def count_tiles(splats, i, width, height):
 def _list(begin, end, size, order, splats, width, height, offsets, slot_tiles, slot_rows, counts):
     """Writes tile and rows of the slots of chunks begin .. end - 1, and how many slots of each lie in a tile."""
     columns = (width + TILE - 1) // TILE
+    s = scratch(splats, WIDTH * 19)
+    tops, bottoms, lines = WIDTH * 16, WIDTH * 17, WIDTH * 18
+    rows = scratch(splats, WIDTH * WIDTH)
+    slots = np.empty(WIDTH, np.int64)
     for chunk in range(begin, end):
-        for rank in range(min(chunk * size, len(order)), min((chunk + 1) * size, len(order))):
-            slot = offsets[rank]
-            if offsets[rank + 1] == slot:
-                continue
-            first, end_column = _columns(splats, order[rank], width)
-            for column in range(first, end_column):
-                low, high = _lines(splats, order[rank], column, height)
-                if low <= high:
-                    for line in range(low // TILE, high // TILE + 1):
-                        slot_tiles[slot] = line * columns + column
-                        slot_rows[slot] = 32 * max(low - line * TILE, 0) + min(high - line * TILE + 1, TILE)
-                        counts[chunk, line * columns + column] += 1
-                        slot += 1
+        finish = min((chunk + 1) * size, len(order))
+        for start in range(chunk * size, finish, WIDTH):
+            count = min(finish - start, WIDTH)
+            for lane in range(WIDTH):
+                rank = start + min(lane, count - 1)
+                store(rows, WIDTH * lane, load(splats, np.int64(order[rank]) * WIDTH))
+                slots[lane] = offsets[rank]
+            transpose(rows, 0, WIDTH, s, 0, WIDTH)
+            column, last = _columns(s, 0, width)
+            while any_of(column <= last):
+                low, high = _lines(s, 0, column, height)
+                store(s, tops, low)
+                store(s, bottoms, where(column <= last, high, -1))
+                store(s, lines, column)
+                for lane in range(count):
+                    top, bottom = int(s[tops + lane]), int(s[bottoms + lane])
+                    if top <= bottom:
+                        slot, tile = slots[lane], (top // TILE) * columns + int(s[lines + lane])
+                        for line in range(top // TILE, bottom // TILE + 1):
+                            slot_tiles[slot] = tile
+                            slot_rows[slot] = 32 * max(top - line * TILE, 0) + min(
+                                bottom - line * TILE + 1, TILE
+                            )
+                            counts[chunk, tile] += 1
+                            tile += columns
+                            slot += 1
+                        slots[lane] = slot
+                column = column + 1
 
 
 @kernel()
