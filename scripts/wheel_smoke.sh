@@ -108,6 +108,24 @@ mesh = trimesh.load_mesh("hull.ply")
 assert hull["voxels"] > 0 and hull["watertight"] and mesh.is_watertight, hull
 print(f"hull of the built-in scene: {hull['voxels']} voxels, {len(mesh.faces)} triangles, watertight")
 PY
+step "short trainings on the built-in scene, opened again by the public names"
+for method in zipnerf+vd visdom-gs; do
+  "$bin/visdom-train" "method:$method" --method.steps 20 --downscale 4 --out "$method" > train.txt 2>&1 \
+    || { cat train.txt; exit 1; }
+done
+"$bin/python" - <<'PY'
+import visdom_plugin as vd
+
+assert not [name for name in vd.__all__ if getattr(vd, name) is None]
+for method in ("zipnerf+vd", "visdom-gs"):
+    run = vd.open_run(method)
+    trained, again = run.metrics["psnr"], run.evaluate()["psnr"]
+    assert run.record["status"] == "finished" and abs(trained - again) < 1e-3, (trained, again)
+    assert (run.path / "report.html").stat().st_size > 50_000
+    print(f"{method}: {trained:.2f} dB after 20 steps, and again from its checkpoint")
+assert (run.path / "export" / "point_cloud.ply").exists()
+print(f"all {len(vd.__all__)} public names of visdom_plugin {vd.__version__}")
+PY
 if [ -n "$out" ]; then
   cp "$work"/dist/* "$out/"
 fi
