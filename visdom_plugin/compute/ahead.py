@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import gc
 import json
-import math
 import os
 import re
 import subprocess
@@ -24,7 +23,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from visdom_plugin.compute.waiting import screen, watch
+from visdom_plugin.compute.waiting import describe_parts, screen, watch
 
 LIST = Path(__file__).with_name("ahead.json")
 """What commands call: kernels with types as `Kernel.spell` writes them, and their numbers by job."""
@@ -179,12 +178,8 @@ class Helper:
         """How far it is, and how long it will take."""
         took = time.monotonic() - (self._began or time.monotonic())
         done, total = sum(k.is_cached() for k in self._kernels), len(self._kernels)
-        if done == total:
-            return f"compiling kernels, once on this machine: {took:.0f} s"
-        text = f"compiling kernels, once on this machine: {done} of {total}"
-        if done < 3 or took < 1:
-            return text
-        return f"{text}, about {math.ceil(took / done * (total - done))} s left"
+        name = "compiling kernels, once on this machine"
+        return f"{name}: {took:.0f} s" if done == total else describe_parts(name, done, total, took)
 
 
 _process: subprocess.Popen[bytes] | None = None

@@ -5,12 +5,16 @@ Off until a command turns it on; for who calls the package from Python it stays 
 
 from __future__ import annotations
 
+import itertools
+import math
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Protocol, TypeVar
+
+_T = TypeVar("_T")
 
 
 class Watcher(Protocol):
@@ -112,6 +116,8 @@ class Screen:
 
 screen = Screen()
 """Of this process."""
+_TELLING = 3
+"""Parts done from which on the seconds left are told."""
 
 
 @contextmanager
@@ -131,3 +137,39 @@ def phase(name: str) -> Iterator[None]:
         yield
     finally:
         screen.end(text)
+
+
+@contextmanager
+def counting(name: str, total: int) -> Iterator[Callable[[_T], _T]]:
+    """A phase of so many parts alike, shown with how many are done and the seconds left.
+
+    Yields:
+        What is to be called with the result of each part, from whatever thread; it returns the result.
+    """
+    began, numbers, done = time.monotonic(), itertools.count(1), 0
+
+    def finished(result: _T) -> _T:
+        nonlocal done
+        done = next(numbers)
+        return result
+
+    def text() -> str:
+        return describe_parts(name, done, total, time.monotonic() - began)
+
+    screen.begin(text)
+    try:
+        yield finished
+    finally:
+        screen.end(text)
+
+
+def describe_parts(name: str, done: int, total: int, took: float) -> str:
+    """How far a phase is, and how long it will take where that can be told.
+
+    Args:
+        took: seconds so far.
+    """
+    text = f"{name}: {done} of {total}, {took:.0f} s"
+    if done < _TELLING or took < 1:
+        return text
+    return f"{text}, about {math.ceil(took / done * max(total - done, 0))} s left"

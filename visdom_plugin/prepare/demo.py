@@ -16,6 +16,7 @@ from datamodules.synthetic.paint import paint_object
 from datamodules.synthetic.render import rasterise
 from datamodules.synthetic.shape import watering_can
 from visdom_plugin.atomic_files import write_bytes
+from visdom_plugin.compute.waiting import counting
 from visdom_plugin.geometry.camera_paths import look_at_camera
 from visdom_plugin.prepare.board import make_board
 from visdom_plugin.prepare.settings import BoardSettings
@@ -74,19 +75,21 @@ def write_demo(folder: Path, config: DemoConfig, board: BoardSettings | None = N
     """Writes the photographs as JPEG files; returns the truth."""
     board = board or BoardSettings()
     texture = _board_texture(board)
-    truths = []
-    for i in range(config.views):
-        upright = config.portrait and i % 3 == 2
-        size = config.size[::-1] if upright else config.size
-        truth = Truth(
-            f"IMG_{i + 1:04d}.jpg", _pose(i, config.views), _FOCAL_35 / _DIAGONAL * math.hypot(*size), size
-        )
-        picture = _photograph(truth, config, board, texture, i)
-        if upright:
-            picture = turn(picture, undo_turn(6))
-        write_bytes(folder / truth.name, _jpeg(picture, 6 if upright else 1, config))
-        truths.append(truth)
-    return truths
+    with counting("drawing photographs", config.views) as count:
+        return [count(_write_view(folder, config, board, texture, i)) for i in range(config.views)]
+
+
+def _write_view(folder: Path, config: DemoConfig, board: BoardSettings, texture: np.ndarray, i: int) -> Truth:
+    upright = config.portrait and i % 3 == 2
+    size = config.size[::-1] if upright else config.size
+    truth = Truth(
+        f"IMG_{i + 1:04d}.jpg", _pose(i, config.views), _FOCAL_35 / _DIAGONAL * math.hypot(*size), size
+    )
+    picture = _photograph(truth, config, board, texture, i)
+    if upright:
+        picture = turn(picture, undo_turn(6))
+    write_bytes(folder / truth.name, _jpeg(picture, 6 if upright else 1, config))
+    return truth
 
 
 def true_mask(truth: Truth, size: tuple[int, int], radial: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 
 from datamodules.files.undistort import Distortion
 from datamodules.views.reader import map_on_cores
+from visdom_plugin.compute.waiting import counting, phase
 from visdom_plugin.errors import SceneError, list_some
 from visdom_plugin.prepare.board import Corners, corner_points, find_corners, other_boards
 from visdom_plugin.prepare.calibrate import calibrate
@@ -32,7 +33,9 @@ def place_by_board(
         SceneError: no board, another board, too few views of it, or photographs of several cameras.
     """
     require_one_camera(photographs)
-    found = map_on_cores(lambda i: find_corners(_grey(photographs[i]), settings), range(len(photographs)))
+    every = range(len(photographs))
+    with counting("looking for the board in the photographs", len(photographs)) as count:
+        found = map_on_cores(lambda i: count(find_corners(_grey(photographs[i]), settings)), every)
     if not any(len(c.ids) for c in found):
         _refuse(photographs, found, settings)
     sizes = [p.size for p in photographs]
@@ -42,7 +45,8 @@ def place_by_board(
     else:
         focals = [p.focal_px for p in photographs if p.focal_px]
         focal = float(np.median(focals)) if focals else None
-    result = calibrate(found, corner_points(settings), sizes, names, focal)
+    with phase("placing the cameras"):
+        result = calibrate(found, corner_points(settings), sizes, names, focal)
     placed = [i for i, view in enumerate(result.views) if view.world_from_camera is not None]
     K = np.zeros((len(placed), 3, 3))
     K[:, 0, 0] = K[:, 1, 1] = result.focal_px

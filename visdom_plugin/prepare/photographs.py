@@ -15,6 +15,7 @@ import numpy as np
 from datamodules.files.images import ENDINGS, decode_photograph, read_header
 from datamodules.files.paths import read_file, stem
 from datamodules.views.find_files import loose_key
+from visdom_plugin.compute.waiting import counting
 from visdom_plugin.errors import SceneError, list_some
 
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".3gp")
@@ -87,7 +88,8 @@ def find_photographs(folder: Path) -> tuple[list[Photograph], list[str]]:
     _refuse_clashes(files, base)
     notes = [f"not read: {list_some(group)}, which {what}" for group, what in (
         (videos, "are videos"), (raw, "are raw photographs")) if group]  # fmt: skip
-    return [_read(path, base) for path in files], notes
+    with counting("reading what the files say", len(files)) as count:
+        return [count(_read(path, base)) for path in files], notes
 
 
 def _list(folder: Path) -> tuple[Path, list[Path]]:

@@ -14,6 +14,7 @@ from datamodules.capture import Calibration, Capture, Frame, Pools
 from datamodules.files.undistort import Distortion
 from datamodules.open_scene import open_capture
 from datamodules.request import Request
+from visdom_plugin.compute.waiting import phase
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.prepare.photographs import Photograph
 from visdom_plugin.scene import Scene
@@ -41,6 +42,7 @@ class Placed:
     notes: Sequence[str] = ()
 
 
+@phase("reading the photographs")
 def read_placed(placed: Placed, root: Path, *, size: int, masks: str | None, look: bool) -> Scene:
     """Photographs without lens distortion and the masks that are there, as training views of a scene.
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import SceneError
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.refine.poses import LEAST_VIEWS, refine_poses
@@ -41,7 +42,8 @@ def fit_to_masks(
             where="--refine-poses",
             todo="add photographs or masks (--masks, --mask-source), or leave --refine-poses out",
         )
-    found = refine_poses(cameras[known], [m for m in masks if m is not None], [ignored[i] for i in known])
+    with phase("turning the cameras until the masks agree"):
+        found = refine_poses(cameras[known], [m for m in masks if m is not None], [ignored[i] for i in known])
     motion = cameras.world_from_camera.clone()
     motion[torch.as_tensor(known)] = found.cameras.world_from_camera
     views: list[dict[str, float]] = [{} for _ in masks]

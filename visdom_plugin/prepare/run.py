@@ -13,6 +13,7 @@ import numpy as np
 
 from datamodules.files.images import turn
 from datamodules.recognise import find_folder, opening
+from visdom_plugin.compute.waiting import counting, phase
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.figures.contact_sheet import picture_names, write_png
 from visdom_plugin.geometry.cameras import Cameras
@@ -171,9 +172,10 @@ def _make(plan: Plan, root: Path, placed: Placed, asked: dict[str, Any], notes: 
         "notes": [*notes, *placed.notes, *scene.notes[1:], *fitted, *tried],
     }
     said = [_say(record["views"][p.name]) for p in placed.photographs]
-    with write.appearing_folder(plan.out) as folder:
+    with write.appearing_folder(plan.out) as folder, counting("writing the scene", len(names)) as count:
         for i, name in enumerate(names):
             write.write_view(folder, name, images[i], masks[i], ignored[i])
+            count(name)
         write_png(folder / write.SHEET, draw_outlines(images, masks, names, said))
         write.finish(folder, cameras, names, record)
     return Prepared(True, record, record["notes"])
@@ -186,6 +188,7 @@ def _turn_left(photograph: Photograph, shape: Sequence[int]) -> int:
     return 1 if upright or tag in _MIRRORED else tag
 
 
+@phase("trying the poses on the silhouettes")
 def _try_poses(
     cameras: Cameras, masks: Sequence[np.ndarray | None], names: Sequence[str], guessed: bool
 ) -> list[str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from datamodules.views.reader import map_on_cores
+from visdom_plugin.compute.waiting import counting
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.hull.carving.carve import carve_silhouettes
 from visdom_plugin.hull.carving.votes import gather_silhouettes
@@ -72,13 +73,34 @@ def cut_views(
         plane: whether the box stands on a plane that the views show, as a board on a table.
         rounds: of correction by the hull.
     """
+    with counting("making masks", (3 + rounds) * len(images)) as count:
+        masks, copies = _cut_together(cameras, images, names, box, plane, rounds, count)
+
+        def whole(i: int) -> np.ndarray:
+            mask = np.zeros(images[i].shape[:2], bool)
+            mask[copies.windows[i]] = tidy(enlarge(masks[i], images[i][copies.windows[i]]))
+            return mask
+
+        return map_on_cores(whole, range(len(images)))
+
+
+def _cut_together(
+    cameras: Cameras,
+    images: Sequence[np.ndarray],
+    names: Sequence[str],
+    box: np.ndarray,
+    plane: bool,
+    rounds: int,
+    count: Callable[[np.ndarray], np.ndarray],
+) -> tuple[list[np.ndarray], _Copies]:
+    """The masks of small copies, and these; each mask that is cut on the way is counted."""
     for last in (False, True):
         copies = _copy(cameras, images, names, box)
         unlike: Sequence[np.ndarray | None] = [None] * len(images)
         if plane and len(images) >= plate.LEAST_VIEWS:
             unlike = plate.differences(copies.cameras, copies.images, box)
         starts = [_start(inside, other) for inside, other in zip(copies.inside, unlike, strict=True)]
-        masks = _cut_all(copies.images, starts)
+        masks = _cut_all(copies.images, starts, count)
         for _ in range(rounds if last else 1):
             hull = _carve(copies.cameras, masks, box)
             if hull is None:
@@ -90,7 +112,7 @@ def cut_views(
             corrected = [
                 _correct(*x) for x in zip(copies.images, starts, masks, outlines, unlike, strict=True)
             ]
-            masks = _cut_all(copies.images, corrected)
+            masks = _cut_all(copies.images, corrected, count)
         if not last:
             if hull is None:
                 break
@@ -98,13 +120,7 @@ def cut_views(
             tight = np.asarray(hull.extent)
             room = _ROOM * (tight[1] - tight[0]).max()
             box = np.stack([np.maximum(box[0], tight[0] - room), np.minimum(box[1], tight[1] + room)])
-
-    def whole(i: int) -> np.ndarray:
-        mask = np.zeros(images[i].shape[:2], bool)
-        mask[copies.windows[i]] = tidy(enlarge(masks[i], images[i][copies.windows[i]]))
-        return mask
-
-    return map_on_cores(whole, range(len(images)))
+    return masks, copies
 
 
 def _copy(cameras: Cameras, images: Sequence[np.ndarray], names: Sequence[str], box: np.ndarray) -> _Copies:
@@ -129,8 +145,10 @@ def _copy(cameras: Cameras, images: Sequence[np.ndarray], names: Sequence[str], 
     return _Copies(windows, small, less, outline_of_box(less, box, list(names)))
 
 
-def _cut_all(images: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> list[np.ndarray]:
-    return map_on_cores(lambda i: tidy(cut(images[i], labels[i])), range(len(images)))
+def _cut_all(
+    images: Sequence[np.ndarray], labels: Sequence[np.ndarray], count: Callable[[np.ndarray], np.ndarray]
+) -> list[np.ndarray]:
+    return map_on_cores(lambda i: count(tidy(cut(images[i], labels[i]))), range(len(images)))
 
 
 def _start(inside: np.ndarray, unlike: np.ndarray | None) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from visdom_plugin.compute.waiting import counting, phase
 from visdom_plugin.errors import ConfigError, SceneError, list_some
 
 
@@ -20,15 +21,18 @@ def cut_with_rembg(
     Raises:
         ConfigError: rembg is not installed, or the model's file is not in the folder or cannot be opened.
     """
-    session, remove = open_session(models, model)
-    masks = []
-    for image, name in zip(images, names, strict=True):
+    with phase(f"opening {model}"):
+        session, remove = open_session(models, model)
+
+    def cut(image: np.ndarray, name: str) -> np.ndarray:
         try:
             soft = np.asarray(remove(np.ascontiguousarray(image), session=session, only_mask=True))
         except Exception as error:  # the network's runtime raises whatever it comes across
             raise SceneError(f"rembg failed on {name}: {str(error)[:200]}", where=models) from error
-        masks.append(soft.reshape(image.shape[:2]) > 127)
-    return masks
+        return soft.reshape(image.shape[:2]) > 127
+
+    with counting("making masks", len(images)) as count:
+        return [count(cut(image, name)) for image, name in zip(images, names, strict=True)]
 
 
 def open_session(models: str | None, model: str) -> tuple[Any, Any]:

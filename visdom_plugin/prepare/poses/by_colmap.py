@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from datamodules.views.reader import map_on_cores
+from visdom_plugin.compute.waiting import counting, phase
 from visdom_plugin.errors import ConfigError, SceneError
 from visdom_plugin.prepare.photographs import Photograph, require_one_camera
 from visdom_plugin.prepare.placed import Placed
@@ -54,7 +55,9 @@ def place_by_colmap(photographs: Sequence[Photograph]) -> Placed:
         folder = Path(name)
         (folder / "images").mkdir()
         (folder / "sparse").mkdir()
-        focal = map_on_cores(lambda i: _copy(photographs[i], folder / "images"), range(len(photographs)))[0]
+        every = range(len(photographs))
+        with counting("copying photographs for COLMAP", len(photographs)) as count_copy:
+            focal = map_on_cores(lambda i: count_copy(_copy(photographs[i], folder / "images")), every)[0]
         count = _map(pycolmap, folder, focal)
         if count < 2:
             raise SceneError(
@@ -88,9 +91,13 @@ def _map(pycolmap: Any, folder: Path, lens: tuple[float, float, float]) -> int:
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "RADIAL"
     reader.camera_params = ",".join(map(str, (*np.array(lens).tolist(), 0.0, 0.0)))
-    pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader)
-    pycolmap.match_exhaustive(database)
-    maps = pycolmap.incremental_mapping(database, images, folder / "maps")
+    single = pycolmap.CameraMode.SINGLE
+    with phase("COLMAP, 1 of 3: features"):
+        pycolmap.extract_features(database, images, camera_mode=single, reader_options=reader)
+    with phase("COLMAP, 2 of 3: matches"):
+        pycolmap.match_exhaustive(database)
+    with phase("COLMAP, 3 of 3: the map"):
+        maps = pycolmap.incremental_mapping(database, images, folder / "maps")
     if not maps:
         return 0
     best = max(maps.values(), key=lambda found: found.num_reg_images())
