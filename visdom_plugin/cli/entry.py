@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import logging
 import shlex
 import sys
@@ -98,6 +99,8 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
     finally:
         screen.turn(False)
         ahead.finish()
+        if argv is None:
+            gc.freeze()  # the interpreter ends, and looks at no object again: half a second with torch and numba
 
 
 def _check_views(text: str | None) -> None:

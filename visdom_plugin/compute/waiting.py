@@ -80,6 +80,12 @@ class Screen:
             if text in self._phases:
                 self._phases.remove(text)
 
+    def show(self) -> None:
+        """On a terminal at once what else is shown after a while: before work that lets no thread write."""
+        with self._lock:
+            if self._on and self._phases and sys.stderr.isatty():
+                self._draw(self._phases[-1], self.FIRST)
+
     def clear(self) -> None:
         """To be called before something else is written; the line comes back when that was a while ago."""
         with self._lock:
@@ -91,13 +97,12 @@ class Screen:
         while True:
             with self._lock:
                 if self._on and self._phases:
-                    self._draw(self._phases[-1])
+                    self._draw(self._phases[-1], time.monotonic() - self._said)
             time.sleep(self.TICK)
 
-    def _draw(self, text: Callable[[], str]) -> None:
+    def _draw(self, text: Callable[[], str], silence: float) -> None:
         if hasattr(sys.stderr, "rich_proxied_file"):
             return  # a bar is moving
-        silence = time.monotonic() - self._said
         if sys.stderr.isatty():
             if self._drawn or silence >= self.FIRST:
                 self._write(f"\r\x1b[K{text()}")

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from visdom_plugin.atomic_files import write_bytes, write_json
+from visdom_plugin.compute.waiting import counting
 from visdom_plugin.figures.contact_sheet import colour_depth, draw_error, shown_on_sheet, to_bytes
 from visdom_plugin.geometry.camera_paths import orbit, widen
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
@@ -65,11 +66,12 @@ def gather(run: Finished) -> Path:
     views, kind = (run.scene.test, "test") if len(run.scene.test) else (run.scene.train, "training")
     shown = shown_on_sheet(len(views))[:SHOWN]
     pixels, drawn = 0, []
-    for n, i in enumerate(shown):
-        camera = _narrow(views.cameras[i], _WIDTH)
-        render = _draw(run, camera)
-        pixels += int(camera.width) * int(camera.height)
-        drawn.append(_keep_view(folder, n, views, i, render))
+    with counting("drawing views for the report", len(shown)) as count:
+        for n, i in enumerate(shown):
+            camera = _narrow(views.cameras[i], _WIDTH)
+            render = _draw(run, camera)
+            pixels += int(camera.width) * int(camera.height)
+            drawn.append(count(_keep_view(folder, n, views, i, render)))
     rate = max(time.monotonic() - began, 1e-6) / max(pixels, 1)
     data = {
         "state": state_of(run.record),
@@ -126,9 +128,11 @@ def _keep_orbit(folder: Path, run: Finished, rate: float) -> dict[str, Any]:
     circle = orbit(cameras, _FRAMES, centre)
     if run.hull is not None:
         circle = widen(circle, run.hull.sample_points(_SEEN, generator(0, "orbit")))
-    frames = [
-        to_bytes(_draw(run, circle[i].resized(width, height)).rgb.detach().cpu()) for i in range(_FRAMES)
-    ]
+    with counting("drawing an orbit for the report", _FRAMES) as count:
+        frames = [
+            count(to_bytes(_draw(run, circle[i].resized(width, height)).rgb.detach().cpu()))
+            for i in range(_FRAMES)
+        ]
     file = _write(folder, "orbit", np.concatenate(frames, 1))
     return {"file": file, "frames": _FRAMES, "width": width, "height": height}
 

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from visdom_plugin.errors import PluginError
 from visdom_plugin.geometry.camera_paths import capture_up
 from visdom_plugin.geometry.cameras import Cameras, look_at_point
 from visdom_plugin.viewer.drawing import COMPARISONS, SIDE_BY_SIDE, UNDER_SLIDER, Look, draw
 from visdom_plugin.viewer.path_controls import PathControls
+from visdom_plugin.viewer.serve import require_viser
 from visdom_plugin.viewer.shown import Subject, pose_of, splat_arrays
 
 log = logging.getLogger(__name__)
@@ -50,14 +50,9 @@ class Viewer:
     """
 
     def __init__(self, subject: Subject, host: str, port: int):
-        try:
-            import viser
-        except ImportError as error:
-            raise PluginError(
-                "the viewer needs viser, which is not installed",
-                todo="pip install 'visdom-plugin[viewer]'",
-                topic="not-installed",
-            ) from error
+        require_viser()
+        import viser
+
         self.subject = subject
         cameras = subject.scene.train.cameras
         centre = look_at_point(cameras).double().numpy() if subject.hull is None else subject.hull.centre

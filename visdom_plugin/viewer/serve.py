@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import socket
+from importlib.util import find_spec
 
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, PluginError
 
 FIRST = 8080
 _TRIED = 100
@@ -29,6 +30,20 @@ def choose_port(host: str, port: int | None) -> int:
         where=f"--port {port}" if port is not None else f"--host {host}",
         todo="leave --port out, and a free one is taken" if port is not None else "choose another --host",
     )
+
+
+def require_viser() -> None:
+    """Refuses where viser is not installed, before anything is loaded.
+
+    Raises:
+        PluginError: it is not.
+    """
+    if find_spec("viser") is None:
+        raise PluginError(
+            "the viewer needs viser, which is not installed",
+            todo="pip install 'visdom-plugin[viewer]'",
+            topic="not-installed",
+        )
 
 
 def describe_address(host: str, port: int) -> list[str]:

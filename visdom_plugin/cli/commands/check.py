@@ -16,6 +16,7 @@ import tyro
 from datamodules.built_in import on_disk
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
+from visdom_plugin.cli.output.terminal import load_torch
 from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import PAGE, ConfigError, SceneError, list_some
 
@@ -66,6 +67,7 @@ def _main(argv: Sequence[str]) -> int:
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         raise ConfigError("this is a file, not a folder", where=f"--out {options.out}", todo="name a folder")
     started = time.perf_counter()
+    load_torch()
     from visdom_plugin.cli.scenes import carving_views, open_scene
 
     try:

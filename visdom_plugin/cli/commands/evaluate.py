@@ -12,6 +12,7 @@ import tyro
 
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.early import read_early
+from visdom_plugin.cli.output.terminal import load_torch, say, show_oracle, show_result
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         return leave_one_out.main([word for word in argv if word != "--leave-one-out"])
     options = tyro.cli(Options, args=argv, prog="visdom-eval")
 
-    from visdom_plugin.cli.output.terminal import say, show_oracle, show_result
+    load_torch()
     from visdom_plugin.cli.runs import open_run
     from visdom_plugin.training.run import evaluate_again
 

@@ -14,6 +14,7 @@ import tyro
 from datamodules.built_in import PREFIX, on_disk
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.options import Device, SceneOptions, read_options
+from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.cli.subject import PointCloud, Subject, is_run, is_splat_file, open_subject
 from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import ConfigError
@@ -82,6 +83,7 @@ def _export(argv: Sequence[str]) -> None:
         _show(options)
         return
     target = _target(options)
+    load_torch()
     with phase("exporting"):
         if options.format == "dataset":
             written = _write_dataset(options, target)
@@ -333,7 +335,6 @@ def _carve(views: Any) -> Hull | None:
 
 
 def _say(options: Options, text: str) -> None:
-    from visdom_plugin.cli.output.terminal import say
 
     if not options.quiet:
         say(text)

@@ -15,6 +15,7 @@ from visdom_plugin.cli.clashes import NEEDS_OF_HULL, refuse_unread
 from visdom_plugin.cli.commands.check import check_views, describe_check, summarise_fit
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
+from visdom_plugin.cli.output.terminal import load_torch
 from visdom_plugin.compute import ahead
 from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import ConfigError
@@ -85,6 +86,7 @@ def _main(argv: Sequence[str]) -> None:
     if options.frames < 1:
         raise ConfigError(f"--frames is {options.frames}; it must be at least 1")
     ahead.prepare("hull")
+    load_torch()
     from visdom_plugin.cli.scenes import open_scene
 
     masks = None

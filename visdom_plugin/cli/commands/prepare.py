@@ -13,7 +13,7 @@ import tyro
 
 from visdom_plugin.cli.clashes import NEEDS_OF_PREPARE, refuse_unread
 from visdom_plugin.cli.entry import run
-from visdom_plugin.compute.waiting import phase
+from visdom_plugin.cli.output.terminal import load_torch
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.prepare.settings import BoardSettings, MaskSettings, MaskWay, Volume
 
@@ -102,8 +102,8 @@ def _main(argv: Sequence[str]) -> None:
             "no folder of photographs is named",
             todo="visdom-prepare PHOTOS --out SCENE, or visdom-prepare --print-board board.pdf",
         )
-    with phase("loading torch"):
-        from visdom_plugin.prepare.run import Plan, prepare
+    load_torch()
+    from visdom_plugin.prepare.run import Plan, prepare
 
     out = options.out or Path(f"{options.photographs.resolve().name}_scene")
     masks = MaskSettings(
@@ -143,8 +143,8 @@ def _print_board(options: Options, board: BoardSettings) -> None:
 
 
 def _write_demo(options: Options, board: BoardSettings) -> None:
-    with phase("loading torch"):
-        from visdom_plugin.prepare.demo import DemoConfig, write_demo
+    load_torch()
+    from visdom_plugin.prepare.demo import DemoConfig, write_demo
 
     assert options.demo is not None
     if options.demo.exists() and (not options.demo.is_dir() or any(options.demo.iterdir())):

@@ -13,6 +13,7 @@ import tyro
 
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.options import Device, SceneOptions
+from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.cli.subject import Subject, is_splat_file, open_subject
 from visdom_plugin.errors import ConfigError, unknown_name
 
@@ -73,8 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _render(argv: Sequence[str]) -> None:
     options = _check(tyro.cli(Options, args=argv, prog="visdom-render"))
-
-    from visdom_plugin.cli.output.terminal import say
+    load_torch()
     from visdom_plugin.figures.videos import name_codec
     from visdom_plugin.geometry.camera_paths import framed
     from visdom_plugin.training.progress import Progress

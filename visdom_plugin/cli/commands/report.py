@@ -11,6 +11,7 @@ import tyro
 
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.options import Device
+from visdom_plugin.cli.output.terminal import load_torch
 from visdom_plugin.errors import ConfigError
 
 
@@ -46,6 +47,7 @@ def _report(argv: Sequence[str]) -> None:
     if options.out is not None and options.out.suffix.lower() not in (".html", ".htm"):
         raise ConfigError("the name of a page ends in .html", where=f"--out {options.out}")
 
+    load_torch()
     from visdom_plugin.report.page import NAME, write_page
 
     for run in options.runs:

@@ -8,9 +8,9 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from visdom_plugin.cli import entry, options
-from visdom_plugin.cli.output.terminal import say, show_next, show_result
+from visdom_plugin.cli.output.terminal import load_torch, say, show_next, show_result
 from visdom_plugin.compute.ahead import prepare, training_job
-from visdom_plugin.compute.waiting import phase
+from visdom_plugin.viewer.serve import require_viser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -25,19 +25,21 @@ def _train(argv: Sequence[str]) -> None:
         sys.stdout.write(options.dump(request))
         return
     common.find_scene_folder()
+    if common.view:
+        require_viser()
     quiet = common.quiet
     if not quiet:
         data = "the built-in scene" if common.data is None else common.data
         say(f"{request.preset.name} on {data}, {request.note}")
     if not options.may_use_cuda(common.device):
         prepare(training_job(request.preset.name))
-    with phase("loading torch"):
-        device = options.resolve_device(common.device)
+    load_torch()
+    device = options.resolve_device(common.device)
 
-        from visdom_plugin.cli.commands.check import warn_of_faults
-        from visdom_plugin.cli.runs import default_run_dir, train_as_asked
-        from visdom_plugin.cli.scenes import open_scene
-        from visdom_plugin.scene import describe_masks
+    from visdom_plugin.cli.commands.check import warn_of_faults
+    from visdom_plugin.cli.runs import default_run_dir, train_as_asked
+    from visdom_plugin.cli.scenes import open_scene
+    from visdom_plugin.scene import describe_masks
 
     scene = open_scene(common.data, **options.read_options(common))
     folder = common.out or default_run_dir(scene.name, len(scene.train), request.preset.name, common.seed)
@@ -73,23 +75,9 @@ def _train(argv: Sequence[str]) -> None:
 
 @contextmanager
 def watching(folder: Path) -> Iterator[None]:
-    """A block during which visdom-view shows the run of a folder, in a process of its own.
-
-    Raises:
-        PluginError: viser is not installed.
-    """
+    """A block during which visdom-view shows the run of a folder, in a process of its own."""
     import subprocess
-    from importlib.util import find_spec
 
-    from visdom_plugin.errors import PluginError
-
-    if find_spec("viser") is None:
-        raise PluginError(
-            "the viewer needs viser, which is not installed",
-            where="--view",
-            todo="pip install 'visdom-plugin[viewer]', or leave --view out",
-            topic="not-installed",
-        )
     words = [sys.executable, "-m", "visdom_plugin.cli.commands.view", str(folder), "--wait"]
     viewer = subprocess.Popen(words)
     try:

@@ -13,6 +13,7 @@ import tyro
 from datamodules.built_in import on_disk
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.options import Device, SceneOptions, read_options
+from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.cli.subject import PointCloud, is_run, is_splat_file, open_subject
 from visdom_plugin.errors import CheckpointError, ConfigError
 
@@ -59,10 +60,11 @@ def _view(argv: Sequence[str]) -> None:
         wait_for_state(what)
     if (place := on_disk(what)) is not None and not place.exists():
         raise ConfigError("there is no such file or folder", where=what)
-    from visdom_plugin.viewer.serve import choose_port, describe_address
+    from visdom_plugin.viewer.serve import choose_port, describe_address, require_viser
 
+    require_viser()
     choose_port(options.host, options.port)
-    from visdom_plugin.cli.output.terminal import say
+    load_torch()
     from visdom_plugin.viewer.app import Viewer
 
     subject = open_shown(options)

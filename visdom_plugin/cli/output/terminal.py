@@ -5,10 +5,11 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Iterable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from visdom_plugin.compute.waiting import screen
+from visdom_plugin.compute.waiting import phase, screen
 from visdom_plugin.tables.measures import MEASURES
 
 ROWS = (
@@ -38,6 +39,13 @@ def say(text: str) -> None:
     """One line for the user, on stderr so that stdout stays for results."""
     screen.clear()
     print(text, file=sys.stderr, flush=True)
+
+
+def load_torch() -> None:
+    """Imports torch, which takes the first second or two of most commands, and says so."""
+    with phase("loading torch"):
+        screen.show()
+        import_module("torch")
 
 
 def show_files(folder: Path, named: Iterable[tuple[str, str]]) -> None:
