@@ -3,9 +3,9 @@
     python benchmarks/system/first_words.py [--show] [--once] [--longest 2] visdom-hull [OPTION ...]
 
 The command runs twice, on a terminal (where a bar moves) and into a pipe (a line comes every five seconds there);
---once leaves the pipe out, --show prints what was written, each piece with its second. A silence is listed with
-the processor time that the command took in it, helpers included, and with the line that stood on the screen: on a busy
-machine, one of little processor time is the machine's fault.
+--once leaves the pipe out, --show prints what was written, each piece with its second. Silences are listed, with
+the line that stood on the screen and the processor time that the command took, helpers included: on a busy
+machine, a silence of little processor time is the machine's fault.
 """
 
 from __future__ import annotations

@@ -73,11 +73,11 @@ def run(command: Callable[[Sequence[str]], int | None], argv: Sequence[str] | No
     except KeyboardInterrupt as stop:
         # By name, because importing the class would import torch.
         resumable = type(stop).__name__ == "Interrupted"
-        program = program_of(command)
-        again = (
-            "the same command resumes" if program is None else f"go on with: {shlex.join([program, *words])}"
-        )
-        print("interrupted" + (f"; {again}" if resumable else ""), file=sys.stderr, flush=True)
+        again = "; the same command resumes" if resumable else ""
+        if program := program_of(command):
+            how = "go on" if resumable else "repeat"
+            again = f"; {how} with: {shlex.join([program, *words])}"
+        print(f"interrupted{again}", file=sys.stderr, flush=True)
         return INTERRUPTED
     except BrokenPipeError:
         # The reader went away, as in `visdom-methods | head`.

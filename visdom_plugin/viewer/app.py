@@ -85,7 +85,7 @@ class Viewer:
         self.server.stop()
 
     def wait(self) -> None:
-        """Returns when `stop` is called, or on Ctrl-C."""
+        """Returns when `stop` is called."""
         while not self._done.wait(0.5):
             pass
 

@@ -77,6 +77,8 @@ def _view(argv: Sequence[str]) -> None:
         say(f"{hint}\nCtrl-C ends it")
     try:
         viewer.wait()
+    except KeyboardInterrupt:
+        pass  # as was said
     finally:
         viewer.stop()
 
