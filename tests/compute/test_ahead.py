@@ -283,6 +283,18 @@ def test_the_line_moves_in_silence_and_is_gone_afterwards(terminal, quick_screen
     assert ("\r" in said) == terminal
 
 
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_gets_the_line_at_once_where_it_is_asked_for(terminal, monkeypatch):
+    output, screen = Screen(terminal), waiting.Screen()
+    monkeypatch.setattr(sys, "stderr", output)
+    monkeypatch.setattr(screen, "_thread", object())  # none writes later
+    screen.show()
+    screen.turn(True)
+    screen.begin(lambda: "loading")
+    screen.show()
+    assert output.text == ("\r\x1b[Kloading" if terminal else "")
+
+
 def test_what_is_said_stands_on_a_line_of_its_own(quick_screen, monkeypatch):
     output = Screen(terminal=True)
     monkeypatch.setattr(sys, "stderr", output)

@@ -1,5 +1,6 @@
 """The viewer shows a scene and a run in a browser, and what is toggled there changes the picture."""
 
+import signal
 import socket
 import time
 from dataclasses import replace
@@ -110,6 +111,27 @@ def test_without_viser_the_extra_is_named(subject, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(PluginError, match=r"(?s)viser.*visdom-plugin\[viewer\]"):
         Viewer(subject, "127.0.0.1", 0)
+
+
+@pytest.mark.parametrize("words", [["builtin:duck"], ["builtin:duck", "--wait"]])
+def test_the_viewer_refuses_before_it_waits_or_loads_and_so_does_training(words, monkeypatch, capsys):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "viser", None)
+    for module, name in ((view, "load_torch"), (view, "wait_for_state"), (train, "load_torch")):
+        monkeypatch.setattr(module, name, lambda *_: pytest.fail("too late"))
+    assert view.main(words) == 2 and train.main(["method:ingp", "--view"]) == 2
+    assert capsys.readouterr().err.count("viser, which is not installed") == 2
+
+
+def test_ctrl_c_is_the_end_that_was_announced(subject, monkeypatch, capsys):
+    pytest.importorskip("viser")
+    from visdom_plugin.viewer.app import Viewer
+
+    monkeypatch.setattr(view, "open_shown", lambda options: subject)
+    monkeypatch.setattr(Viewer, "wait", lambda self: signal.raise_signal(signal.SIGINT))
+    assert view.main([]) == 0
+    assert capsys.readouterr().err.splitlines()[-1] == "Ctrl-C ends it"
 
 
 def test_a_run_that_trains_is_followed(tmp_path):

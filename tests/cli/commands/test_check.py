@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shlex
 import shutil
 import subprocess
 import sys
@@ -14,8 +15,10 @@ import torch
 from datamodules import load
 from tests.datamodules.layouts.prepared_writer import write_prepared
 from tests.hull.checks.faults import FAULTS, capture_of
+from visdom_plugin.cli import options
 from visdom_plugin.cli.commands import train
 from visdom_plugin.cli.commands.check import check_views, main, warn_of_faults
+from visdom_plugin.cli.output.reports import training_command
 from visdom_plugin.figures.check_sheet import draw_check
 from visdom_plugin.scene import Scene, Views
 
@@ -129,6 +132,24 @@ def test_mistakes_exit_with_2_and_a_message(words, said, capsys, tmp_path, monke
     shown = capsys.readouterr()
     assert said in shown.err
     assert shown.out == "" and "Traceback" not in shown.err
+
+
+def test_a_sound_scene_ends_with_the_command_that_trains_on_it(folder, capsys):
+    assert main([str(folder), "--downscale", "2"]) == 0
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == f"next: visdom-train method:visdom-gs --data {folder} --downscale 2"
+    assert main([str(folder), "--quiet"]) == 0 and capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("longest", "factor"), [(200, 2), (799, 2), (800, 4), (1500, 4), (4032, 16)])
+def test_the_command_to_train_with_makes_large_pictures_small(tmp_path, longest, factor):
+    scene = tmp_path / "my scene"
+    scene.mkdir()
+    asked = options.parse(["method:visdom-gs", str(scene), "--downscale", "2", "--train-list", "a,b"]).common
+    words = shlex.split(training_command(scene, options.read_options(asked), longest))
+    common = options.parse(words[1:]).common
+    assert (words[0], common.data, common.downscale) == ("visdom-train", scene, factor)
+    assert common.train_list == "a,b"
 
 
 def test_a_k_that_asks_too_much_exits_with_1(folder, capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,7 +16,7 @@ import pytest
 
 from tests.training import fake
 from visdom_plugin.cli import convert, entry, runs
-from visdom_plugin.cli.commands import evaluate, export, methods, prepare, render, report, train
+from visdom_plugin.cli.commands import check, evaluate, export, methods, prepare, render, report, train
 from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.scene import Views
 from visdom_plugin.training.runs.run_directory import hash_views
@@ -269,9 +270,14 @@ def test_bugs_pass_through_with_a_hint_and_signals_give_130(capsys):
     assert entry.run(stop, []) == 130 and capsys.readouterr().err == "interrupted\n"
 
 
+def test_ctrl_c_says_which_command_to_repeat(capsys, monkeypatch):
+    monkeypatch.setattr(check, "load_torch", lambda: signal.raise_signal(signal.SIGINT))
+    assert check.main(["builtin:duck", "--views", "5"]) == 130
+    assert capsys.readouterr().err == "interrupted; repeat with: visdom-check builtin:duck --views 5\n"
+
+
 def test_an_interrupted_training_says_that_the_same_command_resumes(fakes, capsys, monkeypatch):
     import os
-    import signal
 
     step_of = fake.FakeMethod.train_step
 

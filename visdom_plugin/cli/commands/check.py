@@ -16,7 +16,8 @@ import tyro
 from datamodules.built_in import on_disk
 from visdom_plugin.cli.entry import run
 from visdom_plugin.cli.options import FolderOptions, read_options
-from visdom_plugin.cli.output.terminal import load_torch
+from visdom_plugin.cli.output.reports import training_command
+from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import PAGE, ConfigError, SceneError, list_some
 
@@ -103,6 +104,10 @@ def _main(argv: Sequence[str]) -> int:
         report["out"] = str(options.out)
         write_bytes(options.out / "check.json", (json.dumps(report, indent=1) + "\n").encode())
     _show(report, options)
+    if not (found.findings or options.json or options.quiet):
+        cameras = scene.train.cameras
+        longest = int(max(cameras.width.max(), cameras.height.max()))
+        say(f"next: {training_command(folder, read_options(options), longest)}")
     return FOUND if found.findings else 0
 
 

@@ -12,7 +12,7 @@ import tyro
 
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.early import read_early
-from visdom_plugin.cli.output.terminal import load_torch, say, show_oracle, show_result
+from visdom_plugin.cli.output.terminal import load_torch, say, show_next, show_oracle, show_result
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,7 @@ def _evaluate(argv: Sequence[str]) -> int:
         show_result(record, options.run)
         if options.oracle:
             show_oracle(record)
+        show_next(options.run)
     return 0
 
 

@@ -16,6 +16,7 @@ from visdom_plugin.cli.options import Device, SceneOptions, read_options
 from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.cli.subject import PointCloud, is_run, is_splat_file, open_subject
 from visdom_plugin.errors import CheckpointError, ConfigError
+from visdom_plugin.viewer.serve import choose_port, describe_address, require_viser
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -56,13 +57,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _view(argv: Sequence[str]) -> None:
     options = tyro.cli(Options, args=list(argv), prog="visdom-view")
     what = options.what
+    require_viser()
     if what is not None and options.wait:
         wait_for_state(what)
     if (place := on_disk(what)) is not None and not place.exists():
         raise ConfigError("there is no such file or folder", where=what)
-    from visdom_plugin.viewer.serve import choose_port, describe_address, require_viser
-
-    require_viser()
     choose_port(options.host, options.port)
     load_torch()
     from visdom_plugin.viewer.app import Viewer

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from visdom_plugin.compute.waiting import phase
 
+SWIFT_PX = 400
+"""Longest side of pictures on which the quick schedules take a minute or two."""
+
 if TYPE_CHECKING:
     from visdom_plugin.hull.hull import Hull
     from visdom_plugin.scene import Scene
@@ -57,19 +60,9 @@ def repeat_command(record: dict[str, Any]) -> str:
     Settings that no option can express, such as a whole hull where the variant has none, are left to run.json.
     """
     from visdom_plugin import registry
-    from visdom_plugin.cli.options import READING, Common
     from visdom_plugin.training.runs.config_io import as_plain
 
-    data = record["data"]
-    words = ["visdom-train", f"method:{record['method']}"]
-    if data.get("path"):
-        words += ["--data", data["path"]]
-    plain = as_plain(Common())
-    for name in READING:
-        value = data.get(name, plain.get(name))
-        if value != plain.get(name) and value is not None:
-            prefix = "data." if name in ("missing_masks", "mask_source") else ""
-            words += _flag(prefix + name, value)
+    words = _training_words(record["method"], record["data"])
     if record["seed"]:
         words += ["--seed", str(record["seed"])]
     if record.get("budget"):
@@ -78,6 +71,37 @@ def repeat_command(record: dict[str, Any]) -> str:
     default = as_plain(getattr(preset, record.get("budget") or "quick"))
     words += _changes("method", default, record["config"])
     return shlex.join(words)
+
+
+def training_command(scene: Path | None, reading: dict[str, Any], longest_px: int) -> str:
+    """The command line that trains a first splat on a scene that a command has looked at.
+
+    Args:
+        scene: its folder as the user named it; None for the built-in one.
+        reading: how it was read, see `options.read_options`.
+        longest_px: the longest side of its pictures as they were read; twice `SWIFT_PX` and more are made smaller.
+    """
+    factor = reading["downscale"] * 2 ** max(0, (longest_px // SWIFT_PX).bit_length() - 1)
+    factor = int(factor) if factor == int(factor) else factor
+    plain = reading | {"path": scene and str(scene), "downscale": factor}
+    return shlex.join(_training_words("visdom-gs", plain))
+
+
+def _training_words(method: str, data: dict[str, Any]) -> list[str]:
+    """As far as they name the method, the scene, and how it is read."""
+    from visdom_plugin.cli.options import READING, Common
+    from visdom_plugin.training.runs.config_io import as_plain
+
+    words = ["visdom-train", f"method:{method}"]
+    if data.get("path"):
+        words += ["--data", data["path"]]
+    plain = as_plain(Common())
+    for name in READING:
+        value = data.get(name, plain.get(name))
+        if value != plain.get(name) and value is not None:
+            prefix = "data." if name in ("missing_masks", "mask_source") else ""
+            words += _flag(prefix + name, value)
+    return words
 
 
 def _changes(name: str, before: Any, after: Any) -> list[str]:
