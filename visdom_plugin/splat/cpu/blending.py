@@ -13,7 +13,7 @@ import numpy as np
 from visdom_plugin.compute import lanes
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.lane_math import exp2
-from visdom_plugin.compute.lanes import any_of, fill, load, maximum, minimum, store, where
+from visdom_plugin.compute.lanes import any_of, fill, load, minimum, store, where
 from visdom_plugin.splat.cpu.projection import LOG2_ALPHA_MIN, LOG2_E, RECORD
 from visdom_plugin.splat.cpu.tiles import TILE, scratch
 
@@ -96,7 +96,7 @@ def blend(
                     power = a_dx - dy * (c * dy + b_dx)
                     dy = dy - one
                     passes = power >= real(LOG2_ALPHA_MIN)
-                    opacity = minimum(exp2(maximum(power, real(LOG2_ALPHA_MIN))), real(ALPHA_MAX))
+                    opacity = minimum(exp2(power), real(ALPHA_MAX))  # of any power: what is below is dropped
                     t = load(s, p + T)
                     weight = opacity * t
                     left_over = t - weight
@@ -180,20 +180,17 @@ def blend_backward(
                 for p in range(r0 * PLANES, r1 * PLANES, PLANES):
                     power = a_dx - dy * (c * dy + b_dx)
                     drawn = (power >= real(LOG2_ALPHA_MIN)) & (load(s, p + END) > place)
-                    full = exp2(maximum(power, real(LOG2_ALPHA_MIN)))
+                    full = exp2(power)  # of any power: what is not drawn is dropped
                     opacity = minimum(full, real(ALPHA_MAX))
-                    inverse = one / (one - opacity)
+                    share = where(drawn, opacity / (one - opacity), nothing)
                     t, behind = load(s, p + T), load(s, p + BEHIND)
-                    before = t * inverse
-                    weight = where(drawn, opacity * before, nothing)
+                    weight = share * t  # opacity times what comes to the Gaussian, t / (1 - opacity)
                     g_red, g_green, g_blue, g_z = (
                         load(s, p + RED), load(s, p + GREEN), load(s, p + BLUE), load(s, p + Z),
                     )  # fmt: skip
                     q = g_red * red + g_green * green + g_blue * blue + g_z * z
-                    g_sigma = where(
-                        drawn & (full <= real(ALPHA_MAX)), full * (behind * inverse - before * q), nothing
-                    )
-                    store(s, p + T, where(drawn, before, t))
+                    g_sigma = where(full <= real(ALPHA_MAX), share * (behind - t * q), nothing)
+                    store(s, p + T, t + weight)
                     store(s, p + BEHIND, behind + weight * q)
                     s_red, s_green = s_red + weight * g_red, s_green + weight * g_green
                     s_blue, s_z = s_blue + weight * g_blue, s_z + weight * g_z
