@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -18,42 +19,35 @@ from numba.extending import intrinsic
 from visdom_plugin.compute.kernels import kernel
 
 LANES, ROWS = 16, 8
-"""What one call of `_accumulate` works on: two registers of 256 bits, or one of 512, for each of eight rows."""
+"""What one call of `_accumulate` works on at least: two registers of 256 bits, or one of 512, for each of eight rows."""
+TWICE = "avx512f" in get_host_cpu_features()
+"""Whether there are registers for twice as many lanes."""
 TILE = 64
 """Points, a multiple of `ROWS`."""
+STRIDE = 112
+"""Between two points of a tile, whatever its width: a constant, so that rows need no registers of their own, and a
+multiple of `LANES` that spreads them over the first cache."""
 PIECE = 1024
 """Points whose gradients are summed before any others are added: a constant, whatever the number of threads."""
 
 
 @intrinsic
 def _accumulate(
-    typing_context, room, a_at, a_row, a_step, b_at, b_step, count, base_at, base_row, gate_at, gate_row, least,
+    typing_context, room, vectors, turned, gated, a_at, b_at, b_step, count, base_at, base_row, gate_at, least,
     out_at, out_row,
 ):  # fmt: skip
-    """Matrix product of `ROWS` rows and `LANES` lanes within `room`, the sums in registers.
+    """Matrix product of `ROWS` rows and `LANES` lanes, or a multiple, within `room`, the sums in registers.
 
-    room[out_at + r out_row + lane] = room[base_at + ...] + sum over k < count of room[a_at + r a_row + k a_step]
-    room[b_at + k b_step + lane]; at least `least`, and 0 unless room[gate_at + ...] is above 0.
+    room[out_at + r out_row + lane] = room[base_at + r base_row + lane] + sum over k < count of
+    room[a_at + r STRIDE + k] room[b_at + k b_step + lane]; at least `least`, and, if gated, 0 unless
+    room[gate_at + r STRIDE + lane] is above 0. Turned, the first factor is room[a_at + r + k STRIDE].
+    `vectors` is a tuple as long as there are multiples of `LANES`; `turned`, `gated` are tuples, () for no.
     """
 
     def generate(context, builder, signature, arguments):
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        (
-            _,
-            a_at,
-            a_row,
-            a_step,
-            b_at,
-            b_step,
-            count,
-            base_at,
-            base_row,
-            gate_at,
-            gate_row,
-            least,
-            out_at,
-            out_row,
-        ) = arguments
+        a_at, b_at, b_step, count, base_at, base_row, gate_at, least, out_at, out_row = arguments[4:]
+        wide, is_turned, is_gated = (len(t) for t in signature.args[1:4])
         vector, index = ir.VectorType(ir.FloatType(), LANES), ir.IntType(32)
         undefined, zeros = (
             ir.Constant(vector, ir.Undefined),
@@ -67,50 +61,90 @@ def _accumulate(
             one = builder.insert_element(undefined, number, index(0))
             return builder.shuffle_vector(one, undefined, zeros)
 
-        def vectors(at, row):
-            places = (
+        def vectors_from(place):
+            """The vectors of a row."""
+            return [
+                builder.bitcast(builder.gep(place, [b_at.type(LANES * v)]), vector.as_pointer())
+                for v in range(wide)
+            ]
+
+        def vectors_of_rows(at, row):
+            """Those of all rows, one row after the other."""
+            places = [
                 builder.gep(data, [builder.add(at, builder.mul(row, row.type(r)))]) for r in range(ROWS)
-            )
-            return [builder.bitcast(place, vector.as_pointer()) for place in places]
+            ]
+            return [place for row in places for place in vectors_from(row)]
 
         sums = [
             cgutils.alloca_once_value(builder, builder.load(place, align=4))
-            for place in vectors(base_at, base_row)
+            for place in vectors_of_rows(base_at, base_row)
         ]
         with cgutils.for_range(builder, count) as loop:
             place = builder.gep(data, [builder.add(b_at, builder.mul(loop.index, b_step))])
-            factor = builder.load(builder.bitcast(place, vector.as_pointer()), align=4)
-            first = builder.add(a_at, builder.mul(loop.index, a_step))
-            for r, total in enumerate(sums):
-                place = builder.gep(data, [builder.add(first, builder.mul(a_row, a_row.type(r)))])
-                number = everywhere(builder.load(place, align=4))
-                builder.store(builder.call(fused, [number, factor, builder.load(total)]), total)
+            factors = [builder.load(v, align=4) for v in vectors_from(place)]
+            step, to_row = (STRIDE, 1) if is_turned else (1, STRIDE)
+            first = builder.gep(data, [builder.add(a_at, builder.mul(loop.index, a_at.type(step)))])
+            for r in range(ROWS):
+                number = everywhere(builder.load(builder.gep(first, [a_at.type(r * to_row)]), align=4))
+                for factor, total in zip(factors, sums[r * wide : (r + 1) * wide], strict=True):
+                    builder.store(builder.call(fused, [number, factor, builder.load(total)]), total)
         floor, nothing = everywhere(least), ir.Constant(vector, [0.0] * LANES)
-        for total, gate, place in zip(
-            sums, vectors(gate_at, gate_row), vectors(out_at, out_row), strict=True
-        ):
+        gates = vectors_of_rows(gate_at, gate_at.type(STRIDE)) if is_gated else [None] * len(sums)
+        for total, gate, place in zip(sums, gates, vectors_of_rows(out_at, out_row), strict=True):
             value = builder.load(total)
             value = builder.select(builder.fcmp_ordered("<", value, floor), floor, value)  # NaN stays
-            is_open = builder.fcmp_ordered(">", builder.load(gate, align=4), nothing)
-            builder.store(builder.select(is_open, value, nothing), place, align=4)
+            if gate is not None:
+                is_open = builder.fcmp_ordered(">", builder.load(gate, align=4), nothing)
+                value = builder.select(is_open, value, nothing)
+            builder.store(value, place, align=4)
         return context.get_dummy_value()
 
     integer = types.int64
-    return types.none(room, *[integer] * 10, types.float32, integer, integer), generate
+    scalars = [*[integer] * 7, types.float32, integer, integer]
+    return types.none(room, vectors, turned, gated, *scalars), generate
 
 
 @kernel(error_model="numpy")
 def _multiply(
-    rows, width, room, a_at, a_row, a_step, b_at, b_step, count, base_at, base_row, gate_at, gate_row, least,
-    out_at, out_row,
-):  # fmt: skip
+    rows,
+    width,
+    room,
+    turned,
+    gated,
+    a_at,
+    b_at,
+    b_step,
+    count,
+    base_at,
+    base_row,
+    gate_at,
+    least,
+    out_at,
+    out_row,
+):
     """`_accumulate` for any number of rows and lanes, which are rounded up."""
-    for lane in range(0, width, LANES):
-        for r in range(0, rows, ROWS):
-            _accumulate(
-                room, a_at + r * a_row, a_row, a_step, b_at + lane, b_step, count, base_at + r * base_row + lane,
-                base_row, gate_at + r * gate_row + lane, gate_row, least, out_at + r * out_row + lane, out_row,
-            )  # fmt: skip
+    next_row = 1 if len(turned) else STRIDE
+    for r in range(0, rows, ROWS):
+        a, base, gate, out = (
+            a_at + r * next_row,
+            base_at + r * base_row,
+            gate_at + r * STRIDE,
+            out_at + r * out_row,
+        )
+        lane = 0 * width
+        while lane < width:
+            if TWICE and width - lane > LANES:
+                _accumulate(
+                    room, (0, 0), turned, gated, a, b_at + lane, b_step, count, base + lane, base_row, gate + lane,
+                    least, out + lane, out_row,
+                )  # fmt: skip
+                lane += 2 * LANES
+            else:
+                _accumulate(
+                    room, (0,), turned, gated, a, b_at + lane, b_step, count, base + lane, base_row, gate + lane,
+                    least, out + lane, out_row,
+                )  # fmt: skip
+                lane += LANES
 
 
 @kernel(error_model="numpy")
@@ -166,7 +200,7 @@ def _lay_out(sizes, again, biased, places):
     """Fills in `places` (L + 1, 8), of each layer: how much of its input comes from the layer before; its first
     parameter; and where these begin: its weights turned to (inputs, outputs padded), its biases, its weights
     (outputs, inputs padded), the gradient of these (outputs padded, inputs padded), that of its biases, its tile
-    (TILE, inputs from the layer before, padded). Returns where the last ends."""
+    (TILE, inputs from the layer before, up to STRIDE). Returns where the last ends."""
     at, parameter = 0, 0
     for layer in range(len(sizes)):
         inputs, outputs = sizes[layer, 0], sizes[layer, 1]
@@ -179,7 +213,7 @@ def _lay_out(sizes, again, biased, places):
         places[layer, 5] = places[layer, 4] + outputs * row + LANES
         places[layer, 6] = places[layer, 5] + wide * row + LANES
         places[layer, 7] = places[layer, 6] + wide
-        at = places[layer, 7] + TILE * _padded(hidden)
+        at = places[layer, 7] + TILE * STRIDE
         parameter += (inputs + biased) * outputs
     return at
 
@@ -203,17 +237,13 @@ def run(begin, end, numbers, sizes, parameters, x, extra, out, g_out, g_x, g_sum
         len(sizes) - 1,
         sizes[-1, 1],
     )  # a mere 0 is a type of its own, and functions are compiled once more
-    one, whole, width, back = zero + 1, zero + TILE, x_row - lead, len(g_out) > 0
+    one, stride, width, back = zero + 1, zero + STRIDE, x_row - lead, len(g_out) > 0
     places = np.empty((layers + 1, 8), np.int64)
-    ones = _lay_out(sizes, again, biased, places)
-    most = zero
-    for layer in range(layers + 1):
-        most = max(most, _padded(sizes[layer, 0]))
-    free = _padded(width)
-    zeros = ones + most
-    above, below, to_input = zeros + most, zeros + most + TILE * most, zeros + most + 2 * TILE * most
-    room = np.zeros(to_input + TILE * free + LANES, np.float32)
-    room[ones:zeros] = 1
+    zeros = _lay_out(sizes, again, biased, places)
+    above, below, to_input = zeros + STRIDE, zeros + (1 + TILE) * STRIDE, zeros + (1 + 2 * TILE) * STRIDE
+    room = np.zeros(to_input + TILE * STRIDE + LANES, np.float32)
+    room = room[-(room.ctypes.data // 4) % LANES :]  # vectors begin where lines of the cache do
+    unbound = np.float32(-np.inf)
     for layer in range(layers):
         inputs, outputs, at = sizes[layer, 0], sizes[layer, 1], places[layer, 1]
         for o in range(outputs):
@@ -226,65 +256,89 @@ def run(begin, end, numbers, sizes, parameters, x, extra, out, g_out, g_x, g_sum
         for layer in range(layers if back else zero):
             room[places[layer, 5] : places[layer, 7]] = 0
         for first in range(piece * PIECE, min((piece + 1) * PIECE, points), TILE):
-            count, at, row = min(whole, points - first), places[0, 7], _padded(sizes[0, 0])
-            _copy(count, width, x, first * x_row + lead, x_row, room, at, row)
-            for p in range(count):
-                of = (first + p) // repeat * extra_width
-                _copy(one, extra_width, extra, of, zero, room, at + p * row + width, zero)
-            room[at + count * row : at + TILE * row] = 0
+            count, at = min(zero + TILE, points - first), places[0, 7]
+            _copy(count, width, x, first * x_row + lead, x_row, room, at, stride)
+            p, of = zero, first // repeat
+            while p < count and extra_width > 0:
+                stop = min(count, (of + 1) * repeat - first)
+                if repeat == 1:
+                    stop = count
+                _copy(
+                    stop - p,
+                    extra_width,
+                    extra,
+                    of * extra_width,
+                    extra_width if repeat == 1 else zero,
+                    room,
+                    at + p * stride + width,
+                    stride,
+                )
+                p, of = stop, of + 1
             for layer in range(layers):
                 inputs, outputs, hidden = sizes[layer, 0], sizes[layer, 1], places[layer, 0]
-                wide, to, to_row = _padded(outputs), places[layer + 1, 7], _padded(places[layer + 1, 0])
+                wide, to = _padded(outputs), places[layer + 1, 7]
                 base, base_row, weights = places[layer, 3], zero, places[layer, 2]
                 least = np.float32(0 if layer + 1 < layers else -np.inf)
                 if hidden < inputs:
                     _multiply(
-                        whole, outputs, room, places[0, 7], row, one, weights + hidden * wide, wide,
-                        inputs - hidden, base, base_row, ones, zero, np.float32(-np.inf), to, to_row,
+                        count, outputs, room, (), (), places[0, 7], weights + hidden * wide, wide, inputs - hidden,
+                        base, base_row, zero, unbound, to, stride,
                     )  # fmt: skip
-                    base, base_row = to, to_row
+                    base, base_row = to, stride
                 _multiply(
-                    whole, outputs, room, places[layer, 7], _padded(hidden), one, weights, wide, hidden,
-                    base, base_row, ones, zero, least, to, to_row,
+                    count, outputs, room, (), (), places[layer, 7], weights, wide, hidden, base, base_row, zero,
+                    least, to, stride,
                 )  # fmt: skip
             outputs, at = sizes[layers, 0], places[layers, 7]
             if not back:
-                _copy(count, outputs, room, at, _padded(outputs), out, first * outputs, outputs)
+                _copy(count, outputs, room, at, stride, out, first * outputs, outputs)
                 continue
-            room[above : above + TILE * most] = 0
-            _copy(count, outputs, g_out, first * outputs, outputs, room, above, most)
-            room[to_input : to_input + TILE * free] = 0
+            _copy(count, outputs, g_out, first * outputs, outputs, room, above, stride)
+            base, base_row = zeros, zero
             for layer in range(layers - 1, -1, -1):
                 inputs, outputs, hidden = sizes[layer, 0], sizes[layer, 1], places[layer, 0]
-                at, tile_row, to_row = places[layer, 7], _padded(hidden), _padded(inputs)
-                grad, weights, unbound = places[layer, 5], places[layer, 4], np.float32(-np.inf)
+                at, row, grad, weights = places[layer, 7], _padded(inputs), places[layer, 5], places[layer, 4]
                 _multiply(
-                    outputs, hidden, room, above, one, most, at, tile_row, count, grad, to_row, ones, zero,
-                    unbound, grad, to_row,
-                )  # fmt: skip
+                    outputs,
+                    hidden,
+                    room,
+                    (0,),
+                    (),
+                    above,
+                    at,
+                    stride,
+                    count,
+                    grad,
+                    row,
+                    zero,
+                    unbound,
+                    grad,
+                    row,
+                )
                 if hidden < inputs:
                     _multiply(
-                        outputs, inputs - hidden, room, above, one, most, places[0, 7], row, count,
-                        grad + hidden, to_row, ones, zero, unbound, grad + hidden, to_row,
+                        outputs, inputs - hidden, room, (0,), (), above, places[0, 7], stride, count,
+                        grad + hidden, row, zero, unbound, grad + hidden, row,
                     )  # fmt: skip
                 for p in range(count if biased else zero):
                     for q in range(outputs):
-                        room[places[layer, 6] + q] += room[above + p * most + q]
+                        room[places[layer, 6] + q] += room[above + p * STRIDE + q]
                 if layer == 0 or hidden < inputs:
                     _multiply(
-                        count, width, room, above, most, one, weights + (zero if layer == 0 else hidden), to_row,
-                        outputs, to_input, free, ones, zero, unbound, to_input, free,
+                        count, width, room, (), (), above, weights + (zero if layer == 0 else hidden), row, outputs,
+                        base, base_row, zero, unbound, to_input, stride,
                     )  # fmt: skip
+                    base, base_row = to_input, stride
                 if layer > 0:
                     _multiply(
-                        count, hidden, room, above, most, one, weights, to_row, outputs, zeros, zero, at, tile_row,
-                        unbound, below, most,
+                        count, hidden, room, (), (0,), above, weights, row, outputs, zeros, zero, at, unbound, below,
+                        stride,
                     )  # fmt: skip
                 above, below = below, above
             for p in range(count):
                 for q in range(lead):
                     g_x[(first + p) * x_row + q] = 0
-            _copy(count, width, room, to_input, free, g_x, first * x_row + lead, x_row)
+            _copy(count, width, room, to_input, stride, g_x, first * x_row + lead, x_row)
         for layer in range(layers if back else zero):
             inputs, outputs = sizes[layer, 0], sizes[layer, 1]
             at = piece * len(parameters) + places[layer, 1]
