@@ -16,6 +16,7 @@ import math
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from visdom_plugin.compute.kernels import kernel
@@ -152,25 +153,30 @@ def _vector_at(context, builder, signature, arguments):
 
 
 @intrinsic
-def _interpolate(typing_context, table, lanes, rows, weights, out, at, row_at, stride, p):
-    """out[at + lane] += sum over the corners of weight * table[row * stride + row_at + lane], as one vector."""
+def _interpolate(typing_context, table, lanes, rows, weights, out, at, row_at, stride, p, count):
+    """out[at + lane] = sum over points p .. p + count - 1 and their corners of weight * table[row * stride + row_at
+    + lane], as one vector."""
 
     def generate(context, builder, signature, arguments):
-        place = _vector_at(context, builder, signature, arguments)
-        products = []
+        *arguments, count = arguments
+        vector = ir.VectorType(ir.FloatType(), len(signature.args[1]))
+        total = cgutils.alloca_once_value(builder, ir.Constant(vector, [0.0] * vector.count))
+        with cgutils.for_range(builder, count) as loop:
+            products = []
 
-        def add(pointer, weight):
-            products.append(builder.fmul(weight, builder.load(pointer, align=4), flags=("contract",)))
+            def add(pointer, weight):
+                products.append(builder.fmul(weight, builder.load(pointer, align=4), flags=("contract",)))
 
-        _emit_corners(context, builder, signature, arguments, add)
-        while len(products) > 1:  # in pairs: one sum after another would wait for the one before
-            pairs = zip(products[::2], products[1::2], strict=True)
-            products = [builder.fadd(a, b, flags=("contract",)) for a, b in pairs]
-        total = builder.fadd(builder.load(place, align=4), products[0], flags=("contract",))
-        builder.store(total, place, align=4)
+            point = builder.add(arguments[-1], loop.index)
+            _emit_corners(context, builder, signature, [*arguments[:-1], point], add)
+            while len(products) > 1:  # in pairs: one sum after another would wait for the one before
+                pairs = zip(products[::2], products[1::2], strict=True)
+                products = [builder.fadd(a, b, flags=("contract",)) for a, b in pairs]
+            builder.store(builder.fadd(builder.load(total), products[0], flags=("contract",)), total)
+        builder.store(builder.load(total), _vector_at(context, builder, signature, arguments), align=4)
         return context.get_dummy_value()
 
-    return types.none(table, lanes, rows, weights, out, *[types.uint64] * 4), generate
+    return types.none(table, lanes, rows, weights, out, *[types.uint64] * 5), generate
 
 
 @intrinsic
@@ -197,11 +203,8 @@ def _gather(table, lanes, features, rows, weights, samples, groups, out, at, str
     wide = U(features)
     for g in range(U(groups)):
         to = U(at) + g * U(stride)
-        for f in range(wide):
-            out[to + f] = np.float32(0)
-        for p in range(g * U(samples), (g + U(1)) * U(samples)):
-            for f in range(U(0), wide, U(len(lanes))):
-                _interpolate(table, lanes, rows, weights, out, to + f, f, wide, p)
+        for f in range(U(0), wide, U(len(lanes))):
+            _interpolate(table, lanes, rows, weights, out, to + f, f, wide, g * U(samples), U(samples))
 
 
 @kernel(fast=True)
