@@ -1,9 +1,10 @@
 """Speed and memory of the hull: block carve against the dense torch votes, and its growth with resolution.
 
-    python benchmarks/hull/carve.py [--resolutions 128 256 512 1024] [--repeats 5]
+    python benchmarks/hull/carve.py [--resolutions 128 256 512 1024] [--repeats 5] [--masks consistent]
 
-Nine views of 800 x 800 of an object with a hole; the reference is measured in the same run. Each resolution is
-carved in a process of its own, so that its peak memory is its own. Times are the least of several runs.
+Nine views of 800 x 800 of an object with a hole, by default its silhouettes as cast from a solid; `--masks
+made-up` has masks that no object has. The reference is measured in the same run. Each resolution is carved in a
+process of its own, so that its peak memory is its own. Times are the least of several runs.
 """
 
 from __future__ import annotations
@@ -25,22 +26,45 @@ from visdom_plugin.hull.carving.keep_rule import KeepRule, as_fraction
 from visdom_plugin.hull.carving.octree import block_carve
 from visdom_plugin.hull.carving.votes import Grid, dense_carve, gather_silhouettes
 from visdom_plugin.hull.domain import VisibleDomain
+from visdom_plugin.hull.hull import Hull
+from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 
 VIEWS, SIZE = 9, 800
 
 
-def capture():
-    """Nine cameras on a wavy ring and the silhouettes of a thick ring with three arms."""
+def cameras_around() -> Cameras:
+    """Nine cameras on a wavy ring."""
     angle = torch.arange(VIEWS, dtype=torch.float64) * 2 * math.pi / VIEWS
     centres = 4 * torch.stack([angle.cos(), angle.sin(), 0.4 + 0.3 * (3 * angle).sin()], -1)
     motion = look_at_camera(centres, torch.zeros(VIEWS, 3).double(), torch.tensor([0.0, 0, 1]).double())
     intrinsics = torch.tensor([[1000.0, 0, SIZE / 2], [0, 1000, SIZE / 2], [0, 0, 1]]).double()
-    cameras = Cameras.from_matrices(intrinsics.expand(VIEWS, 3, 3), motion, width=SIZE, height=SIZE)
+    return Cameras.from_matrices(intrinsics.expand(VIEWS, 3, 3), motion, width=SIZE, height=SIZE)
+
+
+def capture() -> tuple[Cameras, list[torch.Tensor]]:
+    """Cameras and the silhouettes of a thick ring with three arms, cast through its voxels."""
+    axis = (torch.arange(256) + 0.5) / 128 - 1
+    x, y, z = 1.2 * axis[:, None, None], 1.2 * axis[None, :, None], 1.2 * axis
+    ring = ((x * x + y * y).sqrt() - 0.5).square() + z * z < 0.3**2
+    for turn in (0, 1, 2):
+        cos, sin = math.cos(2 * math.pi / 3 * turn), math.sin(2 * math.pi / 3 * turn)
+        along, across = (x * cos + y * sin).clamp(0.5, 1.0), y * cos - x * sin
+        ring = ring | ((x * cos + y * sin - along).square() + across * across + z * z < 0.18**2)
+    solid = Hull(ring.numpy(), np.array([[-1.2] * 3, [1.2] * 3]), {})
+    cameras = cameras_around()
+    return cameras, [depth_and_silhouette(solid, camera)[1] for camera in cameras]
+
+
+def made_up() -> tuple[Cameras, list[torch.Tensor]]:
+    """The same cameras, all with one mask: no object has these silhouettes, so a carve also looks for causes."""
     y, x = np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2
     far = np.hypot(x, y)
     arms = np.cos(3 * np.arctan2(y, x)) > 0.8
     mask = (far < 190) & (far > 45) | arms & (far < 260)
-    return cameras, [torch.from_numpy(mask)] * VIEWS
+    return cameras_around(), [torch.from_numpy(mask)] * VIEWS
+
+
+CAPTURES = {"consistent": capture, "made-up": made_up}
 
 
 def plain_votes(cameras: Cameras, masks, grid: Grid, rule: KeepRule) -> torch.Tensor:
@@ -74,9 +98,9 @@ def least(call, repeats: int) -> float:
     return min(times)
 
 
-def measure(resolution: int, repeats: int) -> dict:
+def measure(resolution: int, repeats: int, masks_of: str) -> dict:
     """One resolution: seconds of votes to grid and of the whole call with bounds, bytes, occupied voxels."""
-    cameras, masks = capture()
+    cameras, masks = CAPTURES[masks_of]()
     VisibleDomain(resolution=32).carve(cameras, masks)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     hulls, whole = [], []
@@ -101,9 +125,9 @@ def measure(resolution: int, repeats: int) -> dict:
     }
 
 
-def compare(repeats: int) -> None:
+def compare(repeats: int, masks_of: str) -> None:
     """256^3: block carve against both dense votes."""
-    cameras, masks = capture()
+    cameras, masks = CAPTURES[masks_of]()
     hull = VisibleDomain(resolution=256, components="all").carve(cameras, masks)
     grid, rule = Grid(hull.bounds[0], hull.voxel_size, hull.shape), KeepRule(VIEWS, 3, as_fraction(0.95))
     silhouettes = gather_silhouettes(cameras, masks)
@@ -125,16 +149,18 @@ def main() -> None:
     )
     parser.add_argument("--resolutions", type=int, nargs="+", default=[128, 256, 512, 1024])
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--masks", choices=CAPTURES, default="consistent")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
-        print(json.dumps(measure(options.one, options.repeats)))
+        print(json.dumps(measure(options.one, options.repeats, options.masks)))
         return
-    compare(options.repeats)
+    compare(options.repeats, options.masks)
     print("\nresolution  votes s  carve s (bounds, pieces)  peak growth MiB     voxels")
     rows = []
     for resolution in options.resolutions:
         command = [sys.executable, __file__, "--one", str(resolution), "--repeats", str(options.repeats)]
+        command += ["--masks", options.masks]
         rows.append(json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout))
         r = rows[-1]
         times = f"{r['votes_s']:8.3f} {r['carve_s']:8.3f}"

@@ -9,7 +9,7 @@ import argparse
 
 import numpy as np
 import torch
-from carve import capture, least
+from carve import least, made_up
 
 from visdom_plugin.geometry.cameras import rays_of
 from visdom_plugin.hull.domain import VisibleDomain
@@ -23,7 +23,7 @@ def main() -> None:
     )
     parser.add_argument("--rays", type=int, default=2_000_000)
     count = parser.parse_args().rays
-    cameras, masks = capture()
+    cameras, masks = made_up()
     hull = VisibleDomain(resolution=256).carve(cameras, masks)
     random = torch.Generator().manual_seed(0)
     view = torch.randint(len(cameras), (count,), generator=random)

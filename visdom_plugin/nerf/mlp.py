@@ -24,27 +24,6 @@ WIDEST = 96
 """Inputs or outputs of a layer. Beyond, a matrix product of torch's is as fast."""
 
 
-class TruncatedExp(torch.autograd.Function):
-    """exp whose gradient is cut off above exp(15), so that one wild density does not end the training.
-
-    As in Instant-NGP and torch-ngp.
-    """
-
-    @staticmethod
-    def forward(ctx, x: Tensor) -> Tensor:
-        y = torch.exp(x.clamp(max=30))
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> Tensor:
-        (y,) = ctx.saved_tensors
-        return gradient * y.clamp(max=math.exp(15))
-
-
-truncated_exp = TruncatedExp.apply
-
-
 class Perceptron(nn.Sequential):
     """Linear layers with ReLU between them; (..., inputs) to (..., outputs)."""
 

@@ -19,7 +19,7 @@ from numba.extending import intrinsic
 from visdom_plugin.compute.kernels import kernel
 
 LANES, ROWS = 16, 8
-"""What one call of `_accumulate` works on at least: two registers of 256 bits, or one of 512, for each of eight rows."""
+"""What a call of `_accumulate` works on at least: two registers of 256 bits, or one of 512, for each of 8 rows."""
 TWICE = "avx512f" in get_host_cpu_features()
 """Whether there are registers for twice as many lanes."""
 TILE = 64
@@ -325,14 +325,14 @@ def run(begin, end, numbers, sizes, parameters, x, extra, out, g_out, g_x, g_sum
                         room[places[layer, 6] + q] += room[above + p * STRIDE + q]
                 if layer == 0 or hidden < inputs:
                     _multiply(
-                        count, width, room, (), (), above, weights + (zero if layer == 0 else hidden), row, outputs,
-                        base, base_row, zero, unbound, to_input, stride,
+                        count, width, room, (), (), above, weights + (zero if layer == 0 else hidden), row,
+                        outputs, base, base_row, zero, unbound, to_input, stride,
                     )  # fmt: skip
                     base, base_row = to_input, stride
                 if layer > 0:
                     _multiply(
-                        count, hidden, room, (), (0,), above, weights, row, outputs, zeros, zero, at, unbound, below,
-                        stride,
+                        count, hidden, room, (), (0,), above, weights, row, outputs, zeros, zero, at, unbound,
+                        below, stride,
                     )  # fmt: skip
                 above, below = below, above
             for p in range(count):

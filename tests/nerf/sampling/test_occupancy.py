@@ -6,8 +6,10 @@ import torch
 from visdom_plugin.nerf.sampling.occupancy_grid import (
     OccupancyGrid,
     _march_torch,
+    _middles_torch,
     intersect_cube,
     march_occupied,
+    middles_of,
 )
 from visdom_plugin.seeding import generator
 
@@ -92,11 +94,13 @@ def test_march_is_its_definition(grid):
     assert torch.allclose(samples.ends - samples.starts, step[samples.ray])
 
 
-def test_march_equals_its_torch_twin_and_any_number_of_threads(grid):
-    rays = make_rays(2000, seed=3)
+@pytest.mark.parametrize("finer", [1, 40])
+def test_march_equals_its_torch_twin_and_any_number_of_threads(grid, finer):
+    *rays, step, shift = make_rays(2000 // finer, seed=3)
+    rays += [step / finer, shift]
     one, twin = march_occupied(*rays, grid), _march_torch(*rays, grid)
     # Rounding may put a middle on the other side of a cell's face.
-    assert abs(len(one.ray) - len(twin.ray)) <= 2
+    assert abs(len(one.ray) - len(twin.ray)) <= 2 * finer**0.5
     if len(one.ray) == len(twin.ray):
         assert torch.allclose(one.starts, twin.starts, atol=1e-5)
     threads = torch.get_num_threads()
@@ -107,6 +111,12 @@ def test_march_equals_its_torch_twin_and_any_number_of_threads(grid):
         torch.set_num_threads(threads)
     for a, b in zip(one, other, strict=True):
         assert torch.equal(a, b)
+
+
+def test_middles_of_samples_equal_their_torch_twin(grid):
+    rays = make_rays(700, seed=5)
+    samples = march_occupied(*rays, grid)
+    assert torch.equal(middles_of(*rays[:2], samples), _middles_torch(*rays[:2], samples))
 
 
 @pytest.mark.parametrize("walk", [march_occupied, _march_torch])

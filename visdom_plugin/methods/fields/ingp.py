@@ -9,9 +9,10 @@ from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.methods.fields.common import psnr_of, silhouette_loss
 from visdom_plugin.methods.fields.configs import IngpConfig
 from visdom_plugin.methods.fields.marched import MarchedField
+from visdom_plugin.nerf.activations import density_of, padded_sigmoid
 from visdom_plugin.nerf.encoding.hash_grid import encode, initial_table
 from visdom_plugin.nerf.encoding.view_directions import encode_harmonics
-from visdom_plugin.nerf.mlp import perceptron, truncated_exp
+from visdom_plugin.nerf.mlp import perceptron
 from visdom_plugin.nerf.optimiser import FieldOptimiser, warm_up_and_steps
 from visdom_plugin.nerf.sampling.occupancy_grid import OccupancyGrid
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
@@ -76,14 +77,13 @@ class Ingp(MarchedField[IngpConfig]):
         """Density (m,), and the density network's outputs (m, 1 + geometry_features)."""
         c = self.config
         unit = points * (0.5 / c.half_side) + 0.5
-        out = self.density_net(encode(unit, self.table, c.grid))
-        return truncated_exp(out[:, 0] + c.density_bias), out
+        return density_of(self.density_net(encode(unit, self.table, c.grid)), c.density_bias)
 
     def _encode_views(self, directions: Tensor) -> Tensor:
         return encode_harmonics(directions)[..., : self.config.view_degree**2]
 
     def _look(self, features: Tensor, views: Tensor) -> Tensor:
-        return self.colour_net(features, views, lead=1).sigmoid()
+        return padded_sigmoid(self.colour_net(features, views, lead=1))
 
     def _adapt(self, rays: int, samples: int) -> None:
         wanted = int(rays * self.config.samples_per_step / max(samples, 1))

@@ -30,6 +30,7 @@ from visdom_plugin.nerf.sampling.occupancy_grid import (
     PackedSamples,
     intersect_cube,
     march_occupied,
+    middles_of,
     select,
 )
 from visdom_plugin.seeding import draw_on, generator, uniform
@@ -193,5 +194,4 @@ class MarchedField(RadianceField[Config]):
 
 def points_of(rays: LocalRays, samples: PackedSamples) -> Tensor:
     """(M, 3) where the field is asked: the middles of the intervals, in the field's frame."""
-    middles = (samples.starts + samples.ends) / 2
-    return rays.origins[samples.ray] + middles[:, None] * rays.directions[samples.ray]
+    return middles_of(rays.origins, rays.directions, samples)

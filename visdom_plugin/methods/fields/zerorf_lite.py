@@ -24,10 +24,11 @@ from visdom_plugin.methods.fields.common import (
 )
 from visdom_plugin.methods.fields.configs import ZeroRfConfig
 from visdom_plugin.methods.fields.marched import MarchedField, points_of
+from visdom_plugin.nerf.activations import density_of, padded_sigmoid
 from visdom_plugin.nerf.encoding.factors import Factors, PlanesTimesLines, TwoVolumes
 from visdom_plugin.nerf.encoding.view_directions import encode_harmonics
 from visdom_plugin.nerf.frame import Frame, frame_of
-from visdom_plugin.nerf.mlp import draw_weights, truncated_exp
+from visdom_plugin.nerf.mlp import draw_weights
 from visdom_plugin.nerf.optimiser import FieldOptimiser
 from visdom_plugin.nerf.rendering.volume_packed import composite_packed
 from visdom_plugin.nerf.sampling.occupancy_grid import OccupancyGrid, PackedSamples, select
@@ -159,14 +160,13 @@ class ZeroRfLite(MarchedField[ZeroRfConfig]):
         with self._make_once() as made:
             base = self.decoder.base(self.factors.look_up(points, made))
         out = self.decoder.density(nn.functional.silu(base))
-        return truncated_exp(out[:, 0] + self.config.density_bias), base
+        return density_of(out, self.config.density_bias)[0], base
 
     def _encode_views(self, directions: Tensor) -> Tensor:
         return self.decoder.views(encode_harmonics(directions)[..., : self.config.view_degree**2])
 
     def _look(self, features: Tensor, views: Tensor) -> Tensor:
-        colour = self.decoder.colour(nn.functional.silu(features + views)).sigmoid()
-        return colour * (1 + 2 * SATURATION) - SATURATION
+        return padded_sigmoid(self.decoder.colour(nn.functional.silu(features + views)), SATURATION)
 
     @contextmanager
     def _make_once(self) -> Iterator[list[Tensor]]:

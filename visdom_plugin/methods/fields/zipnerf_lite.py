@@ -23,6 +23,7 @@ from visdom_plugin.methods.fields.common import (
 )
 from visdom_plugin.methods.fields.configs import ZipNerfConfig
 from visdom_plugin.methods.fields.radiance_field import RadianceField
+from visdom_plugin.nerf.activations import density_of, padded_sigmoid
 from visdom_plugin.nerf.encoding.hash_grid import (
     HashLayout,
     encode_mean,
@@ -30,7 +31,7 @@ from visdom_plugin.nerf.encoding.hash_grid import (
     mean_square_per_level,
 )
 from visdom_plugin.nerf.encoding.view_directions import encode_sinusoids
-from visdom_plugin.nerf.mlp import perceptron, run_layers, truncated_exp
+from visdom_plugin.nerf.mlp import perceptron, run_layers
 from visdom_plugin.nerf.optimiser import FieldOptimiser, warm_up_and_decay
 from visdom_plugin.nerf.rendering.proposal_losses import antialiased_interlevel_loss, distortion_loss
 from visdom_plugin.nerf.rendering.volume import composite, weights_from_density
@@ -91,7 +92,7 @@ class ColourNet(nn.Module):
         linears = [*self.layers, self.last[0]]
         again = len(self.layers) - 1
         rgb = run_layers(linears, seen, views, lead=1, again=again if again else None)
-        return rgb.sigmoid() * (1 + 2 * RGB_PADDING) - RGB_PADDING
+        return padded_sigmoid(rgb, RGB_PADDING)
 
 
 class Level(NamedTuple):
@@ -235,8 +236,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         t = distances_of(s, near, far, self.config.spacing_power)
         turn = None if generator is None else uniform(generator, self.device, n, count)
         points, std = multisample(rays.origins, rays.directions, t, radius, turn)
-        out = self.model[name](points, std)
-        density = truncated_exp(out[..., 0] + self.config.density_bias)
+        density, out = density_of(self.model[name](points, std), self.config.density_bias)
         return Level(s, t, weights_from_density(density, t)[0]), out
 
     def render_rays(
@@ -277,7 +277,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         return self.model["field"](points, std)
 
     def density(self, points: Tensor) -> Tensor:
-        return truncated_exp(self._field(points)[:, 0] + self.config.density_bias)
+        return density_of(self._field(points), self.config.density_bias)[0]
 
     def _colour(self, points: Tensor, directions: Tensor) -> Tensor:
         return self._shade(self._field(points), directions.to(self.device))

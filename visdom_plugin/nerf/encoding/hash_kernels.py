@@ -154,8 +154,8 @@ def _vector_at(context, builder, signature, arguments):
 
 @intrinsic
 def _interpolate(typing_context, table, lanes, rows, weights, out, at, row_at, stride, p, count):
-    """out[at + lane] = sum over points p .. p + count - 1 and their corners of weight * table[row * stride + row_at
-    + lane], as one vector."""
+    """out[at + lane] = sum over points p .. p + count - 1 and their corners of weight times table[row * stride +
+    row_at + lane], as one vector."""
 
     def generate(context, builder, signature, arguments):
         *arguments, count = arguments

@@ -158,45 +158,49 @@ def intersect_cube(origins: Tensor, directions: Tensor, half_side: float) -> tup
     return enter.amax(-1).clamp_min(0), leave.amin(-1)
 
 
-@kernel()
-def _count(begin, end, origins, directions, near, far, step, shift, occupied, half_side, counts):
-    for r in range(begin, end):
-        counts[r] = _walk(r, origins, directions, near, far, step, shift, occupied, half_side, None, 0)
-
-
-@kernel()
-def _fill(
-    begin, end, origins, directions, near, far, step, shift, occupied, half_side, offsets, starts, rays
-):
-    for r in range(begin, end):
-        at = offsets[r]
-        _walk(r, origins, directions, near, far, step, shift, occupied, half_side, starts, at)
-        for i in range(at, offsets[r + 1]):
-            rays[i] = r
-
-
-@kernel(inline="always")
-def _walk(r, origins, directions, near, far, step, shift, occupied, half_side, starts, at):
+@kernel(error_model="numpy")
+def _count(begin, end, origins, directions, near, far, step, shift, occupied, half_side, counts, marks):
+    """How many samples each ray takes, and a bit for each place along it, set where it takes one."""
     n = occupied.shape[0]
     scale = n / (2 * half_side)
-    ox, oy, oz = origins[r, 0], origins[r, 1], origins[r, 2]
-    dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
-    found = 0
-    i = 0
-    while True:
-        begin = near[r] + (i + shift[r]) * step[r]
-        middle = begin + np.float32(0.5) * step[r]
-        if not middle < far[r]:
-            break
-        x = (ox + middle * dx + half_side) * scale
-        y = (oy + middle * dy + half_side) * scale
-        z = (oz + middle * dz + half_side) * scale
-        if ROUNDING < x < n and ROUNDING < y < n and ROUNDING < z < n and occupied[int(x), int(y), int(z)]:
-            if starts is not None:
-                starts[at + found] = begin
-            found += 1
-        i += 1
-    return found
+    for r in range(begin, end):
+        ox, oy, oz = origins[r, 0], origins[r, 1], origins[r, 2]
+        dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
+        found, i, word = 0, 0, np.uint64(0)
+        while True:
+            middle = near[r] + (i + shift[r]) * step[r] + np.float32(0.5) * step[r]
+            if not middle < far[r]:
+                break
+            x = (ox + middle * dx + half_side) * scale
+            y = (oy + middle * dy + half_side) * scale
+            z = (oz + middle * dz + half_side) * scale
+            if (
+                ROUNDING < x < n
+                and ROUNDING < y < n
+                and ROUNDING < z < n
+                and occupied[int(x), int(y), int(z)]
+            ):
+                word |= np.uint64(1) << np.uint64(i & 63)
+                found += 1
+            i += 1
+            if i & 63 == 0:
+                marks[r, (i >> 6) - 1], word = word, np.uint64(0)
+        if i & 63 != 0:
+            marks[r, i >> 6] = word
+        counts[r] = found
+
+
+@kernel(error_model="numpy")
+def _fill(begin, end, near, step, shift, offsets, marks, starts, ends, rays):
+    for r in range(begin, end):
+        at, i = offsets[r], 0
+        while at < offsets[r + 1]:
+            if marks[r, i >> 6] >> np.uint64(i & 63) & np.uint64(1) != 0:
+                starts[at] = near[r] + (i + shift[r]) * step[r]
+                ends[at] = starts[at] + step[r]
+                rays[at] = r
+                at += 1
+            i += 1
 
 
 @kernel()
@@ -236,14 +240,40 @@ def march_occupied(
     if origins.device.type != "cpu":
         return _march_torch(origins, directions, near, far, step, shift, grid)
     rays = [x.detach().float().contiguous().numpy() for x in (origins, directions, near, far, step, shift)]
-    counts = np.zeros(len(origins), np.int64)
-    world = (*rays, grid.occupied.numpy(), np.float32(grid.half_side))
-    parallel_for(_count, len(origins), 128, *world, counts)
+    counts = np.empty(len(origins), np.int64)
+    longest = float(((far - near) / step).nan_to_num().max()) if len(origins) else 0.0
+    marks = np.empty((len(origins), int(max(longest, 0.0)) // 64 + 2), np.uint64)
+    parallel_for(
+        _count, len(origins), 128, *rays, grid.occupied.numpy(), np.float32(grid.half_side), counts, marks
+    )
     offsets = np.concatenate([[0], np.cumsum(counts)])
-    starts, ray = np.empty(offsets[-1], np.float32), np.empty(offsets[-1], np.int64)
-    parallel_for(_fill, len(origins), 128, *world, offsets, starts, ray)
-    begins, of = torch.from_numpy(starts), torch.from_numpy(ray)
-    return PackedSamples(torch.from_numpy(offsets), of, begins, begins + step[of])
+    starts, ends = np.empty(offsets[-1], np.float32), np.empty(offsets[-1], np.float32)
+    ray = np.empty(offsets[-1], np.int64)
+    parallel_for(_fill, len(origins), 128, *rays[2:3], *rays[4:], offsets, marks, starts, ends, ray)
+    return PackedSamples(*map(torch.from_numpy, (offsets, ray, starts, ends)))
+
+
+def middles_of(origins: Tensor, directions: Tensor, samples: PackedSamples) -> Tensor:
+    """(M, 3) points in the middle of each interval, of rays (n, 3); as they are, without gradient on the CPU."""
+    if origins.device.type != "cpu":
+        return _middles_torch(origins, directions, samples)
+    arrays = [x.detach().contiguous().numpy() for x in (origins, directions, *samples[1:])]
+    out = np.empty((len(samples.ray), 3), np.float32)
+    parallel_for(_middles, len(out), 8192, *arrays, out)
+    return torch.from_numpy(out)
+
+
+def _middles_torch(origins: Tensor, directions: Tensor, samples: PackedSamples) -> Tensor:
+    middles = (samples.starts + samples.ends) / 2
+    return origins[samples.ray] + middles[:, None] * directions[samples.ray]
+
+
+@kernel(error_model="numpy")
+def _middles(begin, end, origins, directions, ray, starts, ends, out):
+    for i in range(begin, end):
+        middle, r = (starts[i] + ends[i]) / np.float32(2), ray[i]
+        for axis in range(3):
+            out[i, axis] = origins[r, axis] + middle * directions[r, axis]
 
 
 def select(samples: PackedSamples, kept: Tensor) -> PackedSamples:
