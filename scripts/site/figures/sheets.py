@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
+import cv2
 from before_after import PICTURES, write_webp
 from trained import train
 
@@ -36,6 +37,8 @@ SHEETS = {
     "visdom_gs_built_in_5_views.webp": Sheet(("3dgs-go+vd", "visdom-gs"), views=5, shown=6),
 }
 MAKES = tuple(SHEETS)
+WIDTH = 1200
+"""Of a picture, in pixels."""
 
 
 def main() -> None:
@@ -48,7 +51,9 @@ def main() -> None:
     args = parser.parse_args()
     for name, sheet in SHEETS.items():
         runs = [train(args.runs, method, sheet.views) for method in sheet.methods]
-        write_webp(draw_runs(runs, sheet.shown), args.out / name)
+        picture = draw_runs(runs, sheet.shown)
+        size = WIDTH, round(picture.shape[0] * WIDTH / picture.shape[1])
+        write_webp(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), args.out / name)
 
 
 if __name__ == "__main__":
