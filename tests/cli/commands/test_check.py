@@ -139,6 +139,10 @@ def test_a_sound_scene_ends_with_the_command_that_trains_on_it(folder, capsys):
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == f"next: visdom-train method:visdom-gs --data {folder} --downscale 2"
     assert main([str(folder), "--quiet"]) == 0 and capsys.readouterr().err == ""
+    # Of two views the usual K = 3 leaves nothing.
+    two = ",".join(load(folder, test=False).train.names[::2])
+    assert main([str(folder), "--train-list", two]) == 0
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f"--train-list {two} --k 2")
 
 
 @pytest.mark.parametrize(("longest", "factor"), [(200, 2), (799, 2), (800, 4), (1500, 4), (4032, 16)])

@@ -1,6 +1,7 @@
 """The check says how good the default choice of views is, and names a better one."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -35,9 +36,13 @@ def test_a_better_choice_is_named_and_can_be_trained_on(views, tmp_path, capsys)
     folder = write_colmap(views, tmp_path / "scene")
     choice = _choice(folder, capsys)
     assert choice["best_degrees"] > choice["degrees"] + 5 and len(choice["best"]) == 4
-    listed = ",".join(choice["best"])
-    assert f"--train-list {listed}" in choice["said"]
+    listed = ",".join(Path(name).stem for name in choice["best"])
+    assert choice["said"].splitlines()[-1] == f"--train-list {listed}"
     assert set(load(folder, train_list=listed, test=False).train.names) == set(choice["best"])
+    # On a terminal, too, the option is one line, which can be copied.
+    assert main([str(folder)]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert f"--train-list {listed}" in shown and shown[0].startswith(f"scene: 4 of {choice['free']} views")
     # Who names views is not told of others, and the best of them is not bettered.
     assert _choice(folder, capsys, "--train-list", listed) is None
 

@@ -107,7 +107,11 @@ def _main(argv: Sequence[str]) -> int:
     if not (found.findings or options.json or options.quiet):
         cameras = scene.train.cameras
         longest = int(max(cameras.width.max(), cameras.height.max()))
-        say(f"next: {training_command(folder, read_options(options), longest)}")
+        from visdom_plugin.hull.checks.covisibility import USUAL_K
+
+        wanted = found.advice.k if found.advice is not None and k is None else k
+        k = None if wanted == USUAL_K else wanted
+        say(f"next: {training_command(folder, read_options(options), longest, k=k)}")
     return FOUND if found.findings else 0
 
 
@@ -261,7 +265,9 @@ def _table(report: dict[str, Any]) -> None:
     rows = [*((f["sure"], f) for f in report["findings"]), *(("note", f) for f in report["notes"])]
     count = len(report["findings"])
     said = "nothing wrong" if count == 0 else "1 finding" if count == 1 else f"{count} findings"
-    console.print(f"[bold]{escape(report['scene'])}[/bold]: {len(report['views'])} views, {said}")
+    choice = report.get("choice")
+    views = f"{len(report['views'])} of {choice['free']} views" if choice else f"{len(report['views'])} views"
+    console.print(f"[bold]{escape(report['scene'])}[/bold]: {views}, {said}")
     if rows:
         table = Table(show_edge=False, pad_edge=False, show_lines=True)
         for title in ("", "sure", "views", "what, and what to do"):
@@ -274,7 +280,7 @@ def _table(report: dict[str, Any]) -> None:
         console.print(table)
         console.print(f"more on each: {PAGE}#findings", soft_wrap=True)
     for line in summarise_fit(report):
-        console.print(escape(line))
+        console.print(escape(line), soft_wrap=True)  # options can be copied whole
     if "out" in report:
         console.print(f"sheet: {escape(report['out'])}/check.png")
 
@@ -297,7 +303,7 @@ def summarise_fit(report: dict[str, Any]) -> list[str]:
             f"Masks and cameras miss each other by {report['misfit']:.2%} of the object's size on average; 0 is a "
             "perfect fit.",
             f"Right beside each mask, the other masks rule the object out by {report['constraint']:.1%} of its "
-            "size on average; near 0 they would not notice a wrong pose.",
+            "size on average; the more, the smaller a wrong pose that they notice.",
         ]
     return lines
 

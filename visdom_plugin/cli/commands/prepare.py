@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -180,7 +181,8 @@ def _summary(made: Prepared, out: Path) -> str:
     lines += [("left out", f"{name}: {why}") for name, why in left.items()]
     lines += [("note", note) for note in made.notes]
     if made.made:
-        lines.append(("next", f"look at {out / 'prepare.png'}, then: visdom-check {out}"))
+        check = f"visdom-check {shlex.quote(str(out))} --views {len(views)}"
+        lines.append(("next", f"look at {out / 'prepare.png'}, then: {check}"))
     width = max(len(name) for name, _ in lines)
     return "".join(f"{name:<{width}}  {text}\n" for name, text in lines)
 

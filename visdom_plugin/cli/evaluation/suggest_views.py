@@ -6,7 +6,7 @@ pixels; only masks of the views that are picked are looked at, and views that ar
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +23,8 @@ _UNFIT = ("border", "empty", "full", "size", "speckled", "inverted")
 class Suggestion(NamedTuple):
     """How the views that train by default do beside the best."""
 
+    count: int
+    """Views that train by default."""
     free: int
     """Views that could train."""
     degrees: float
@@ -32,17 +34,22 @@ class Suggestion(NamedTuple):
     best_degrees: float
     passed_over: tuple[str, ...]
     """Views of the default whose mask is cut off or otherwise unfit."""
+    stems_tell: bool = False
+    """Whether file names without folder and ending tell all views apart."""
 
     def describe(self) -> str:
-        """One sentence or two for the user."""
-        said = f"Of {self.free} views that could train, these are spread by the order of their names"
-        said += f"; the nearest two look from {self.degrees:.0f} degrees apart"
+        """Sentences for the user, and on a line of its own the option that names better views."""
+        said = f"{self.count} of {self.free} views that could train were looked at, spread by the order of their "
+        said += f"names (--views {self.free} checks all); the nearest two look from {self.degrees:.0f} degrees apart"
         if not self.best:
             return f"{said}, and hardly any choice does better."
         if self.passed_over:
             cut = ", ".join(self.passed_over)
-            said += f", and {cut} {'is' if len(self.passed_over) == 1 else 'are'} cut off or badly masked"
-        return f"{said}. Better ({self.best_degrees:.0f} degrees): --train-list {','.join(self.best)}"
+            said += f". {cut} {'is' if len(self.passed_over) == 1 else 'are'} cut off or badly masked"
+        instead = " without it" * (len(self.passed_over) == 1) or " without them" * bool(self.passed_over)
+        stems = [PurePosixPath(name).stem for name in self.best]
+        listed = ",".join(stems if self.stems_tell else self.best)
+        return f"{said}. Better{instead} ({self.best_degrees:.0f} degrees):\n--train-list {listed}"
 
 
 def suggest_views(
@@ -95,7 +102,8 @@ def suggest_views(
     passed = tuple(names[i] for i in default if known[i])
     better = bool(passed) or reached > given + _BETTER_DEGREES
     chosen = tuple(names[i] for i in sorted(best)) if better else ()
-    return Suggestion(len(names), given, chosen, reached, passed)
+    stems_tell = len({PurePosixPath(name).stem for name in names}) == len(names)
+    return Suggestion(count, len(names), given, chosen, reached, passed, stems_tell)
 
 
 def find_unfit(scene: Scene) -> set[str]:

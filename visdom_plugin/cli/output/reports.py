@@ -73,18 +73,21 @@ def repeat_command(record: dict[str, Any]) -> str:
     return shlex.join(words)
 
 
-def training_command(scene: Path | None, reading: dict[str, Any], longest_px: int) -> str:
+def training_command(
+    scene: Path | None, reading: dict[str, Any], longest_px: int, *, k: int | None = None
+) -> str:
     """The command line that trains a first splat on a scene that a command has looked at.
 
     Args:
         scene: its folder as the user named it; None for the built-in one.
         reading: how it was read, see `options.read_options`.
         longest_px: the longest side of its pictures as they were read; twice `SWIFT_PX` and more are made smaller.
+        k: of the visible domain, where it is not the usual one.
     """
     factor = reading["downscale"] * 2 ** max(0, (longest_px // SWIFT_PX).bit_length() - 1)
     factor = int(factor) if factor == int(factor) else factor
     plain = reading | {"path": scene and str(scene), "downscale": factor}
-    return shlex.join(_training_words("visdom-gs", plain))
+    return shlex.join(_training_words("visdom-gs", plain) + ([] if k is None else ["--k", str(k)]))
 
 
 def _training_words(method: str, data: dict[str, Any]) -> list[str]:
