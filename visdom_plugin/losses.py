@@ -76,8 +76,8 @@ def mask_loss(alpha: Tensor, mask: Tensor, weight: Tensor | None = None, clamp: 
         alpha: (H, W) in [0, 1].
         mask: (H, W) float, 1 on the object.
         weight: (H, W) float, 0 at pixels that take no part and 1 elsewhere, or None when all do.
-        clamp: distance from 0 and 1, below 0.5, that opacity and mask keep at least. With more than the default, a
-            mask of 1 is met by an opacity of 1 - `clamp`; an opacity nearer to 0 or 1 than `clamp` has no gradient.
+        clamp: distance from 0 and 1, below 0.5, that opacity and mask keep at least. With more than the default,
+            an opacity of 1 - `clamp` meets a mask of 1, and one nearer to 0 or 1 than `clamp` has no gradient.
     """
     if clamp > 1e-6:
         alpha, mask = (x.clamp(clamp, 1 - clamp) for x in (alpha, mask))

@@ -17,7 +17,7 @@ SHEET_WIDTH_PX = 260
 """Width of one picture on the contact sheet."""
 SHEET_VIEWS = 6
 """Views on the contact sheet, at most."""
-SHEET_ROWS = ("truth", "render", "alpha")
+SHEET_ROWS = ("truth", "render", "opacity")
 _SHEET_TOP, _SHEET_GAP = 24, 4
 _SUFFIXES = ("png", "jpg", "jpeg", "tif", "tiff", "webp", "bmp")
 

@@ -40,7 +40,10 @@ class Suggestion(NamedTuple):
     def describe(self) -> str:
         """Sentences for the user, and on a line of its own the option that names better views."""
         said = f"{self.count} of {self.free} views that could train were looked at, spread by the order of their "
-        said += f"names (--views {self.free} checks all); the nearest two look from {self.degrees:.0f} degrees apart"
+        said += (
+            f"names (--views {self.free} checks all); the nearest two look from {self.degrees:.0f} degrees "
+        )
+        said += "apart"
         if not self.best:
             return f"{said}, and hardly any choice does better."
         if self.passed_over:
