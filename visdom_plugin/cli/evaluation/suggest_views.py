@@ -23,7 +23,7 @@ _UNFIT = ("border", "empty", "full", "size", "speckled", "inverted")
 class Suggestion(NamedTuple):
     """How the views that train by default do beside the best."""
 
-    count: int
+    looked_at: int
     """Views that train by default."""
     free: int
     """Views that could train."""
@@ -39,7 +39,7 @@ class Suggestion(NamedTuple):
 
     def describe(self) -> str:
         """Sentences for the user, and on a line of its own the option that names better views."""
-        said = f"{self.count} of {self.free} views that could train were looked at, spread by the order of their "
+        said = f"{self.looked_at} of {self.free} views that could train were looked at, spread by the order of their "
         said += (
             f"names (--views {self.free} checks all); the nearest two look from {self.degrees:.0f} degrees "
         )
