@@ -39,7 +39,7 @@ class Suggestion(NamedTuple):
 
     def describe(self) -> str:
         """Sentences for the user, and on a line of its own the option that names better views."""
-        said = f"{self.looked_at} of {self.free} views that could train were looked at, spread by the order of their "
+        said = f"{self.looked_at} of {self.free} views that could train were looked at, spread by order of their "
         said += (
             f"names (--views {self.free} checks all); the nearest two look from {self.degrees:.0f} degrees "
         )
