@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 from visdom_plugin.cli import options
 from visdom_plugin.cli.early import WORD, read_early
+from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.errors import ConfigError, EmptyHullError, SceneError
 
 if TYPE_CHECKING:
@@ -82,9 +83,9 @@ def main(argv: Sequence[str]) -> int:
     if common.show_config:
         sys.stdout.write(options.dump(request))
         return 0
+    load_torch()
     device = options.resolve_device(common.device)
 
-    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.cli.scenes import open_scene
 
     scene = open_scene(common.data, **options.read_options(common), fill=False, hold_out=False)
@@ -165,7 +166,6 @@ def run_folds(request: options.Request, scene: Scene, folder: Path, *, device: s
         ConfigError, CheckpointError, PluginError: settings, folder or method will not do, with or without a view.
     """
     from visdom_plugin.atomic_files import write_json
-    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.cli.runs import train_as_asked
     from visdom_plugin.figures.contact_sheet import draw_sheet, picture_names, write_png
     from visdom_plugin.scene import hold_out

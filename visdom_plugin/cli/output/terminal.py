@@ -43,6 +43,8 @@ def say(text: str) -> None:
 
 def load_torch() -> None:
     """Imports torch, which takes the first second or two of most commands, and says so."""
+    if "torch" in sys.modules:
+        return
     with phase("loading torch"):
         screen.show()
         import_module("torch")

@@ -20,6 +20,7 @@ from datamodules.built_in import PREFIX
 from visdom_plugin import registry
 from visdom_plugin.cli.early import WORD, read_early
 from visdom_plugin.cli.options import Common, Request, choose_budget, name_method, resolve_device
+from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.cli.table_parts.run_table import (
     TableOptions,
     change_spec,
@@ -161,6 +162,7 @@ def _fitting(row: Row, preset: registry.Preset) -> Settings:
 
 def _open(spec: TableSpec, options: AblationOptions) -> Scene:
     """The scene whose views the figure shows: at the first number of views, with the first seed."""
+    load_torch()
     from visdom_plugin.cli.scenes import open_scene
 
     column, folds = spec.columns[0], options.leave_one_out
@@ -177,7 +179,6 @@ def _open(spec: TableSpec, options: AblationOptions) -> Scene:
 def _run_folds(spec: TableSpec, scene: Scene, options: AblationOptions, out: Path, runs: Path) -> int:
     """The same table with every training view held out in turn; the views stand as the table's scenes."""
     from visdom_plugin.cli.evaluation import leave_one_out as folds
-    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.tables.report.write import write_all
     from visdom_plugin.training.runs.run_directory import read_record
 
@@ -245,7 +246,6 @@ def _request(row: Row, budget: str, common: Common, note: str) -> Request:
 
 def _draw(results: Results, views: int, photographs: Views, out: Path, quiet: bool) -> None:
     """Writes the figure of one number of views, seed by seed averaged numbers, the first seed's pictures."""
-    from visdom_plugin.cli.output.terminal import say
     from visdom_plugin.cli.table_parts.ablation_figure import draw_figure
     from visdom_plugin.figures.contact_sheet import write_png
 

@@ -12,6 +12,7 @@ import tyro
 
 from datamodules.built_in import DEFAULT, named_built_in, on_disk
 from visdom_plugin.cli.options import resolve_device
+from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.errors import ConfigError, unknown_name
 from visdom_plugin.tables.results import Results
 from visdom_plugin.tables.spec import BUILT_IN, Column, TableSpec, check_spec
@@ -81,7 +82,7 @@ def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | Non
         the exit status, and what there is of the runs; None in place of it when they were only listed, where the
         status is 1 for scenes that cannot be read.
     """
-    from visdom_plugin.cli.output.terminal import say
+    load_torch()
     from visdom_plugin.cli.table_parts.workshop import make_workshop
     from visdom_plugin.tables.report.summary import summarise
     from visdom_plugin.tables.report.write import write_all
