@@ -130,16 +130,20 @@ def test_without_node_the_command_is_said(tmp_path, monkeypatch):
     assert not (tmp_path / "a.sog").exists()
 
 
-def test_sog_and_html_are_made_by_splat_transform(tmp_path, monkeypatch):
-    """A stand-in for the program: what it is handed, and that its file arrives."""
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """A stand-in for splat-transform: what it is handed is copied to what it is to write."""
     tool = tmp_path / "bin" / "splat-transform"
     tool.parent.mkdir()
     tool.write_text('#!/bin/sh\nfor last; do before=$prev; prev=$last; done\ncp "$before" "$last"\n')
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tool.parent}:/usr/bin:/bin")
+
+
+def test_sog_is_made_by_splat_transform(tmp_path, stand_in):
     gaussians = make_gaussians(n=5, dtype=torch.float32).detach()
-    splat_files.write_splats(tmp_path / "a.html", gaussians, torch.tensor([5.0, 0, 0], dtype=torch.float64))
-    (tmp_path / "a.html").rename(tmp_path / "b.ply")
+    splat_files.write_splats(tmp_path / "a.sog", gaussians, torch.tensor([5.0, 0, 0], dtype=torch.float64))
+    (tmp_path / "a.sog").rename(tmp_path / "b.ply")
     back = splat_files.read_splats(tmp_path / "b.ply")
     assert torch.allclose(back.means, gaussians.means + torch.tensor([5.0, 0, 0]))
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,8 @@ from torch import Tensor
 
 from visdom_plugin.atomic_files import appearing, write_bytes
 from visdom_plugin.errors import ConfigError, SceneError
+from visdom_plugin.export.splat_page import write_page
+from visdom_plugin.export.splat_transform import splat_transform
 from visdom_plugin.export.spz import read_spz, write_spz
 from visdom_plugin.geometry.harmonics import C0
 from visdom_plugin.geometry.local_frame import is_near
@@ -23,16 +23,23 @@ from visdom_plugin.splat.spherical_harmonics import sh_from_rgb
 
 WRITTEN = ("ply", "spz", "splat", "sog", "html")
 READ = ("ply", "spz", "splat", "sog")
-_PACKAGE = "@playcanvas/splat-transform@2"
 _SPLAT = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 """The records of a .splat file: scales and colours after activation, no harmonics, w x y z times 128 plus 128."""
 
 
-def write_splats(path: Path, gaussians: Gaussians, origin: Tensor | None = None) -> None:
+def write_splats(
+    path: Path,
+    gaussians: Gaussians,
+    origin: Tensor | None = None,
+    *,
+    title: str | None = None,
+    eye: Tensor | None = None,
+) -> None:
     """Writes Gaussians as the suffix of `path` says; the file appears whole or not at all.
 
     Args:
         origin: (3,) float64 of their frame in the frame the file shall have; None for the same frame.
+        title, eye: of a page, see `write_page`.
 
     Raises:
         ConfigError: the format needs splat-transform, which is not there or fails; or it cannot hold such a frame,
@@ -47,6 +54,8 @@ def write_splats(path: Path, gaussians: Gaussians, origin: Tensor | None = None)
         write_spz(path, gaussians, origin)
     elif kind == "splat":
         write_bytes(path, _splat_bytes(gaussians, origin))
+    elif kind == "html":
+        write_page(path, gaussians, title=title, eye=eye)
     else:
         with tempfile.TemporaryDirectory() as folder, appearing(path) as part:
             plain = Path(folder) / f"{path.stem}.ply"
@@ -108,40 +117,6 @@ def read_near(path: Path) -> tuple[Gaussians, Tensor]:
     if path.suffix.lower() == ".ply":
         return read_ply_near(path)
     return read_splats(path), torch.zeros(3, dtype=torch.float64)
-
-
-def splat_transform(source: Path, target: Path, *, asked: Path) -> None:
-    """Converts by PlayCanvas' splat-transform, which runs on Node.
-
-    Args:
-        asked: the file that the user wants, for the command in an error.
-
-    Raises:
-        ConfigError: Node is not there, or the program fails.
-    """
-    line = f"npx {_PACKAGE} -g cpu FILE.ply {asked.name}"
-    if found := shutil.which("splat-transform"):
-        words = [found]
-    elif found := shutil.which("npx"):
-        words = [found, "--yes", _PACKAGE]
-    else:
-        raise ConfigError(
-            f"a {asked.suffix} file is made by splat-transform, which needs Node.js, and there is none",
-            where=asked,
-            todo=f"install Node.js 18 or later; or export a .ply and run, where there is one: {line}",
-            topic="not-installed",
-        )
-    done = subprocess.run(
-        [*words, "-q", "-w", "-g", "cpu", source, target], capture_output=True, text=True, check=False
-    )
-    if done.returncode or not target.exists():
-        said = (done.stderr or done.stdout).strip().splitlines()
-        raise ConfigError(
-            f"splat-transform failed: {said[-1] if said else f'status {done.returncode}'}",
-            where=asked,
-            cause="no network to fetch it with npx" if "npx" in words[0] else None,
-            todo=f"npm install --global {_PACKAGE}, or export a .ply and run where it works: {line}",
-        )
 
 
 def describe(path: Path) -> dict[str, Any]:

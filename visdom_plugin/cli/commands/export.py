@@ -214,11 +214,14 @@ def _write_splats(options: Options, target: Path) -> list[Path]:
     from visdom_plugin.export.upright import upright
 
     origin: Tensor | None = None
+    eye: Tensor | None = None
+    title = None
     if options.crop == "none" and not options.upright and not is_run(options.run):
         gaussians, origin = _read_plain(options.run)
     else:
         subject = open_subject(options.run, options, options.device, test=False)
         gaussians, origin = _gaussians_of(options, subject)
+        title, eye = subject.scene.name, subject.scene.train.cameras.centres[0].double() - origin
         if options.crop == "hull":
             hull, at = _need_hull(subject), origin
             before = len(gaussians)
@@ -227,8 +230,9 @@ def _write_splats(options: Options, target: Path) -> list[Path]:
         if options.upright:
             motion = upright(subject.scene.train.cameras, torch.as_tensor(_need_hull(subject).centre), "-y")
             motion[:3, 3] += motion[:3, :3] @ origin
+            eye = motion[:3, :3] @ eye + motion[:3, 3]
             gaussians, origin = splats.move(gaussians, motion), None
-    write_splats(target, gaussians, origin)
+    write_splats(target, gaussians, origin, title=title, eye=eye)
     return [target]
 
 
