@@ -46,15 +46,15 @@ def photometric_loss(rgb: Tensor, target: Tensor, ssim_weight: float, weight: Te
         weight: (H, W) float, 0 at pixels that take no part and 1 elsewhere, or None when all do. Both means
             are over the pixels that do; to the windows of SSIM the others look as what is outside the image.
     """
-    share: float | Tensor = 1.0
     if weight is not None:
         counted = weight[..., None] > 0
         rgb, target = torch.where(counted, rgb, 0.0), torch.where(counted, target, 0.0)
-        share = weight.mean().clamp_min(1 / weight.numel())
     if ssim_weight == 0:
-        return (rgb - target).abs().mean() / share
-    l1, similarity = l1_and_ssim(rgb, target)
-    return ((1 - ssim_weight) * l1 + ssim_weight * (1 - similarity)) / share
+        loss = (rgb - target).abs().mean()
+    else:
+        l1, similarity = l1_and_ssim(rgb, target)
+        loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity)
+    return loss if weight is None else loss / weight.mean().clamp_min(1 / weight.numel())
 
 
 OPAQUE = 1 - 1e-6

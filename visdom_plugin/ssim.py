@@ -56,6 +56,7 @@ def _fits(x: Tensor) -> bool:
     return x.shape[-2] * x.shape[-1] >= WIDTH
 
 
+@cache
 def _window() -> np.ndarray:
     weights = np.exp(-0.5 * (np.arange(TAPS) - RADIUS) ** 2 / SIGMA**2)
     return weights / weights.sum()

@@ -28,8 +28,8 @@ def rasterise_cpu(
 ) -> Render:
     """See `rasterise`. float32 or float64, by the dtype of the means."""
     width, height = camera.size
-    packed = _pack(camera, near).to(gaussians.means.dtype).numpy()
     parameters = gaussians.tensors().values()
+    packed = _pack(camera, near).astype(np.float32 if gaussians.means.dtype == torch.float32 else np.float64)
     means2d, splats, radii, tiles = _Project.apply(*parameters, degree, packed, width, height)
     if means2d.requires_grad:
         means2d.retain_grad()
@@ -37,7 +37,7 @@ def rasterise_cpu(
     info = {
         "means2d": means2d,
         "radii": radii,
-        "visible": (radii > 0).all(-1),
+        "visible": (radii[:, 0] > 0) & (radii[:, 1] > 0),
         "conics": splats[:, :3].detach(),
         "colours": splats[:, 4:7].detach(),
         "depths": splats[:, 7].detach(),
@@ -60,19 +60,12 @@ def warm_up() -> None:
     (ssim(render.rgb, torch.zeros(16, 16, 3)) + render.depth.sum()).backward()
 
 
-def _pack(camera: Cameras, near: float) -> Tensor:
+def _pack(camera: Cameras, near: float) -> np.ndarray:
     """(20,) float64, as the projection kernels expect it."""
-    motion, k = camera.camera_from_world.double(), camera.intrinsics.double()
-    lens = torch.stack([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
-    centre = camera.centres.double()
-    parts = [
-        motion[:3, :3].reshape(9),
-        motion[:3, 3],
-        lens,
-        centre,
-        torch.tensor([near], dtype=torch.float64),
-    ]
-    return torch.cat([p.cpu() for p in parts])
+    pose, k = (x.detach().double().cpu().numpy() for x in (camera.world_from_camera, camera.intrinsics))
+    rotation, centre = pose[:3, :3].T, pose[:3, 3]
+    lens = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
+    return np.concatenate([rotation.ravel(), -(rotation @ centre), lens, centre, [near]])
 
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
