@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import threading
 import time
@@ -20,6 +21,8 @@ from visdom_plugin.training.progress import Progress
 from visdom_plugin.training.protocols import Batch, Method, StepOutput
 from visdom_plugin.training.runs import checkpoints
 from visdom_plugin.training.runs.run_directory import Record, RunDir
+
+log = logging.getLogger(__name__)
 
 LOGGED = 100
 """Lines in log.jsonl over the whole schedule."""
@@ -130,6 +133,7 @@ class Trainer:
             self.method.load_state_dict(found.tensors)
             self.step = self.resumed_from = found.step
             self.train_s = float(found.notes.get("train_s", 0))
+            log.info("the run goes on at step %d of %d", self.step, self.method.total_steps)
         for step in checkpoints.list_steps(self.folder):
             if found is None or step > found.step:
                 checkpoints.remove(self.folder, step)

@@ -28,3 +28,13 @@ def test_standard_with_too_few_views_is_said(views, warned, tmp_path, monkeypatc
     assert train.main(words) == 0
     said = " ".join("".join(capsys.readouterr()).split())
     assert ("standard gains from 6 views on" in said) == warned
+
+
+@pytest.mark.parametrize(
+    ("size", "asked", "factor"), [((300, 799), 1, None), ((1600, 1200), 1, 4), ((600, 801), 2, 4)]
+)
+def test_photographs_too_large_for_a_quick_schedule_are_told_of(size, asked, factor):
+    note = train._describe_size(fake.tiny_scene().train.cameras.resized(*size), asked)
+    assert (note is None) == (factor is None)
+    if note is not None:
+        assert note.endswith(f"--downscale {factor}") and f"{size[0]} x {size[1]} pixels" in note

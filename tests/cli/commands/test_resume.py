@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from visdom_plugin.cli.commands import check
 from visdom_plugin.training.runs import checkpoints
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -70,3 +71,9 @@ def test_a_killed_run_of_3dgs_go_vd_ends_bit_for_bit_where_it_would_have(tmp_pat
     records = [json.loads((run / "run.json").read_text()) for run in (whole, cut)]
     assert records[0]["metrics"] == records[1]["metrics"]
     assert (whole / "export/point_cloud.ply").read_bytes() == (cut / "export/point_cloud.ply").read_bytes()
+
+
+def test_ctrl_c_says_which_command_to_repeat(capsys, monkeypatch):
+    monkeypatch.setattr(check, "load_torch", lambda: signal.raise_signal(signal.SIGINT))
+    assert check.main(["builtin:duck", "--views", "5"]) == 130
+    assert capsys.readouterr().err == "interrupted; repeat with: visdom-check builtin:duck --views 5\n"

@@ -6,11 +6,16 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from visdom_plugin.cli import entry, options
+from visdom_plugin.cli.output.reports import SWIFT_PX, swift_factor
 from visdom_plugin.cli.output.terminal import load_torch, say, show_next, show_result
 from visdom_plugin.compute.ahead import prepare, training_job
 from visdom_plugin.viewer.serve import require_viser
+
+if TYPE_CHECKING:
+    from visdom_plugin.geometry.cameras import Cameras
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,6 +57,8 @@ def _train(argv: Sequence[str]) -> None:
             )
         for line in (*describe_masks(scene.train), *scene.notes):
             say(f"data: {line}")
+        if common.budget == "quick" and (note := _describe_size(scene.train.cameras, common.downscale)):
+            say(note)
         say(f"run directory: {folder}")
     warn_of_faults(scene, inverted=common.invert_masks)
     on_finished = None
@@ -71,6 +78,18 @@ def _train(argv: Sequence[str]) -> None:
             say(f"resumed after step {record['resumed_from']}")
         show_result(record, folder)
         show_next(folder)
+
+
+def _describe_size(cameras: Cameras, downscale: float) -> str | None:
+    """What to say of pictures that are too large for quick schedules; None of others."""
+    width, height = (int(size.max()) for size in (cameras.width, cameras.height))
+    factor = swift_factor(downscale, max(width, height))
+    if factor == downscale:
+        return None
+    return (
+        f"the photographs have {width} x {height} pixels, and budget quick is made for 100 to {SWIFT_PX}: it will "
+        f"take long. Quicker: --downscale {factor:g}"
+    )
 
 
 @contextmanager

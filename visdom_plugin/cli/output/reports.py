@@ -84,10 +84,15 @@ def training_command(
         longest_px: the longest side of its pictures as they were read; twice `SWIFT_PX` and more are made smaller.
         k: of the visible domain, where it is not the usual one.
     """
-    factor = reading["downscale"] * 2 ** max(0, (longest_px // SWIFT_PX).bit_length() - 1)
-    factor = int(factor) if factor == int(factor) else factor
+    factor = swift_factor(reading["downscale"], longest_px)
     plain = reading | {"path": scene and str(scene), "downscale": factor}
     return shlex.join(_training_words("visdom-gs", plain) + ([] if k is None else ["--k", str(k)]))
+
+
+def swift_factor(downscale: float, longest_px: int) -> float:
+    """What to pass for `--downscale`, so that pictures read with that factor are less than twice `SWIFT_PX`."""
+    factor = downscale * 2 ** max(0, (longest_px // SWIFT_PX).bit_length() - 1)
+    return int(factor) if factor == int(factor) else factor
 
 
 def _training_words(method: str, data: dict[str, Any]) -> list[str]:
