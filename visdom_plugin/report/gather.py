@@ -106,10 +106,15 @@ def _keep_view(folder: Path, n: int, views: Views, i: int, render: Render) -> di
     truth = _resize(draw_truth(views, i, measured), size)
     rgb = to_bytes(render.rgb.detach().cpu())
     alpha = render.alpha.detach().float().cpu().numpy()
+    ignored = views.ignored(i)
+    # Where nothing is known there is no error.
+    known = (
+        True if ignored is None else ~_resize(ignored.numpy().astype(np.uint8), size).astype(bool)[..., None]
+    )
     pictures = {
         "truth": truth,
         "render": rgb,
-        "error": draw_error(truth, rgb),
+        "error": draw_error(truth, np.where(known, rgb, truth)),
         "depth": colour_depth(render.depth.detach().float().cpu().numpy(), alpha),
         "opacity": np.repeat((alpha.clip(0, 1) * 255).round().astype(np.uint8)[..., None], 3, 2),
     }

@@ -102,10 +102,10 @@ def evaluate(
 
 
 def draw_truth(views: Views, i: int, measured: bool) -> np.ndarray:
-    """The photograph as bytes, on white where a mask tells what is the object."""
+    """The photograph as bytes, on white where a mask tells what is the object; ignored pixels are white."""
     image, ignore = views.images[i], views.ignored(i)
     truth = metrics.whiten(image, views.masks[i]) if measured else image.double() / 255
-    return to_bytes(truth if ignore is None else truth.masked_fill(ignore[..., None], 0.5))
+    return to_bytes(truth if ignore is None else truth.masked_fill(ignore[..., None], 1.0))
 
 
 def _remove_others(folder: Path, names: Sequence[str]) -> None:
