@@ -1,6 +1,6 @@
 """A hull from arrays: cameras and masks in, mesh, volume and bounds of rays out.
 
-Whatever your program has, it comes down to intrinsics, poses and masks. Here they are those of a built-in scene.
+All it needs are intrinsics, poses and masks as arrays. Here they are those of a built-in scene.
 
     python examples/01_hull_from_arrays.py
     python examples/01_hull_from_arrays.py --k 2 --resolution 64 --out duck.ply

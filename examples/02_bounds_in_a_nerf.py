@@ -1,9 +1,9 @@
 """The visible domain in a small NeRF: three lines of it are ours.
 
 A network maps positions to density and colour. With the hull, training rays are sampled inside the visible
-domain, and the mask loss clears what lies outside; `--no-hull` trains the same network without. So small
-and smooth a network hardly makes fog and gains nothing here (23.8 dB with the hull, 24.0 without); a hash grid, as
-in `method:ingp`, gains 9 dB (docs/findings/methods.md).
+domain, and the mask loss clears what lies outside. `--no-hull` trains the same network without it. This network is
+so small and smooth that it hardly makes fog, and so it gains nothing (23.8 dB with the hull, 24.0 without). A hash
+grid, as in `method:ingp`, gains 9 dB (docs/findings/methods.md).
 
     python examples/02_bounds_in_a_nerf.py
     python examples/02_bounds_in_a_nerf.py --no-hull

@@ -1,6 +1,7 @@
 """A table of two methods on two built-in scenes, as Markdown, CSV, LaTeX and one HTML page.
 
-A table is a YAML file; `visdom-table two.yaml` makes the same. Its runs resume, and a second call reuses them.
+A table is a YAML file; `visdom-table two.yaml` makes the same one. Interrupted runs are resumed, and finished ones
+are used again.
 
     python examples/07_table.py
     python examples/07_table.py --steps 20 --downscale 4     # a quick look, in another folder: --out quick

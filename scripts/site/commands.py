@@ -32,7 +32,7 @@ COMMANDS = {
 """Commands in the order of use, with words that have options of their own."""
 HEAD = """# Commands
 
-Made from what `COMMAND --help` says. `{None}|X` takes X, and is unset by default.
+Made from the output of `COMMAND --help`. `{None}|X` means that an option takes X and is unset by default.
 """
 
 

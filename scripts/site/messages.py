@@ -35,9 +35,9 @@ SUBJECTS = {
 }
 HEAD = """# All messages
 
-Every error that the commands and the library say, read from the source; `...` stands for what is filled in. With a
-message comes where it was found, the likely cause and what to do.
-[Troubleshooting](guide/troubleshooting.md) tells more of the frequent ones.
+Every error message of the commands and the library, read from the source. `...` stands for a value that is filled
+in. A message also says where it was found, the likely cause, and what to do.
+[Troubleshooting](guide/troubleshooting.md) says more about the frequent ones.
 """
 
 

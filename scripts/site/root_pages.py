@@ -23,8 +23,8 @@ PAGES = {
 """Files at the top of the tree by their place on the site."""
 EXAMPLES_HEAD = """# Examples
 
-Scripts of `examples/`, from simple to less so. Each runs as it stands; `--help` shows its settings. The notebook
-`examples/08_photographs_to_picture.ipynb` goes from photographs to pictures.
+The scripts of `examples/`, in the order to read them, and a notebook. Each runs as it stands; `--help` of a script
+shows its options.
 """
 _CODE = r"^```.*?^```$|`[^`\n]*`"
 _LINK = re.compile(rf"{_CODE}|(!?)\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)", re.M | re.S)
@@ -53,7 +53,7 @@ def relink(text: str, source: str, place: str) -> str:
 
 def show_examples() -> str:
     """The scripts and notebooks of examples/ with what they say of themselves."""
-    parts = ["# Examples\n\nWhat lies in `examples/`, in the order to read it. Each runs as it stands.\n"]
+    parts = [EXAMPLES_HEAD]
     folder = ROOT / "examples"
     for path in sorted([*folder.rglob("*.py"), *folder.glob("*.ipynb")]):
         show = show_notebook if path.suffix == ".ipynb" else show_script
