@@ -1,4 +1,7 @@
-"""Every relative link and picture in the Markdown files leads to a file that is there, and to a heading of it."""
+"""Every relative link and picture in the Markdown files leads to a file that is there, and to a heading of it.
+
+So does every page of docs/ that a source file names.
+"""
 
 import re
 from pathlib import Path
@@ -9,9 +12,28 @@ ROOT = Path(__file__).parents[2]
 PAGES = sorted(
     [
         *ROOT.glob("*.md"),
-        *(p for folder in ("docs", "examples", "benchmarks") for p in (ROOT / folder).rglob("*.md")),
+        *(
+            p
+            for folder in ("docs", "examples", "benchmarks", ".github")
+            for p in (ROOT / folder).rglob("*.md")
+        ),
     ]
 )
+SOURCES = sorted(
+    path
+    for folder in (
+        "visdom_plugin",
+        "datamodules",
+        "method_configs",
+        "examples",
+        "benchmarks",
+        "scripts",
+        ".github",
+    )
+    for path in (ROOT / folder).rglob("*.*")
+    if path.suffix in (".py", ".ipynb", ".sh", ".yml", ".yaml", ".html", ".js", ".toml")
+)
+NAMED = re.compile(r"(?<![\w/])(docs/[\w/]+\.md)(?:#([\w-]+))?")
 LINK = re.compile(r"\]\((?!\w+:)([^)\s]+)\)")
 
 
@@ -45,6 +67,26 @@ def dead(page: Path) -> list[str]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_no_link_is_dead(page):
     assert dead(page) == []
+
+
+def dead_mentions(text: str) -> list[str]:
+    """Pages of docs/ that are named and not there, and headings that they do not have."""
+    return [
+        f"{name}#{anchor}".rstrip("#")
+        for name, anchor in NAMED.findall(text)
+        if not (ROOT / name).is_file() or (anchor and anchor not in anchors(ROOT / name))
+    ]
+
+
+def test_pages_that_source_files_name_are_there():
+    named = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in SOURCES}
+    assert len(named) > 300 and sum(len(NAMED.findall(text)) for text in named.values()) > 15
+    assert {name: found for name, text in named.items() if (found := dead_mentions(text))} == {}
+
+
+def test_a_dead_mention_is_found():
+    text = "docs/gpu.md, docs/gone.md and (docs/guide/troubleshooting.md#mask-missing, docs/gpu.md#gone)"
+    assert dead_mentions(text) == ["docs/gone.md", "docs/gpu.md#gone"]
 
 
 def test_a_dead_link_is_found(tmp_path):
