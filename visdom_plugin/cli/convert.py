@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from visdom_plugin.cli import entry
+from visdom_plugin.cli.output.terminal import load_torch
 from visdom_plugin.errors import ConfigError, SceneError, list_some
 
 TABLE = "calibration.csv"
@@ -48,6 +49,7 @@ def _convert(argv: Sequence[str]) -> None:
             "there is no such file or folder", where=source, todo="name a model or calibration.csv"
         )
     table = _find_table(source)
+    load_torch()
     count, made = _to_table(source, options) if table is None else _to_model(table, options)
     sys.stdout.write(f"{count} cameras: {made}\n")
 
