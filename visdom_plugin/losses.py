@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from visdom_plugin.ssim import l1_and_ssim
+from visdom_plugin.ssim import l1_with_ssim
 
 
 def composite_target(
@@ -52,8 +52,7 @@ def photometric_loss(rgb: Tensor, target: Tensor, ssim_weight: float, weight: Te
     if ssim_weight == 0:
         loss = (rgb - target).abs().mean()
     else:
-        l1, similarity = l1_and_ssim(rgb, target)
-        loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity)
+        loss = l1_with_ssim(rgb, target, 1 - ssim_weight, -ssim_weight, ssim_weight)
     return loss if weight is None else loss / weight.mean().clamp_min(1 / weight.numel())
 
 

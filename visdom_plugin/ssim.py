@@ -36,19 +36,19 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
         )
     if x.dtype != y.dtype:
         raise ValueError(f"ssim compares images of one dtype, got {x.dtype} and {y.dtype}")
-    return l1_and_ssim(x, y)[1]
+    return l1_with_ssim(x, y, 0.0, 1.0)
 
 
-def l1_and_ssim(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean absolute difference and `ssim` of two images, on the CPU in one pass over them.
+def l1_with_ssim(x: Tensor, y: Tensor, by_l1: float, by_ssim: float, constant: float = 0.0) -> Tensor:
+    """by_l1 mean(|x - y|) + by_ssim ssim + constant, on the CPU in one pass over both images.
 
     Args:
         x, y: as for `ssim`, which checks them.
     """
     y = y.detach()
     if x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64) and _fits(x):
-        return _Compare.apply(x, y, x.requires_grad)
-    return (x - y).abs().mean(), _ssim_by_convolution(x, y)
+        return _Compare.apply(x, y, x.requires_grad, by_l1, by_ssim, constant)
+    return by_l1 * (x - y).abs().mean() + by_ssim * _ssim_by_convolution(x, y) + constant
 
 
 def _fits(x: Tensor) -> bool:
@@ -83,7 +83,7 @@ def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:
 
 class _Compare(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x, y, with_slopes):
+    def forward(ctx, x, y, with_slopes, by_l1, by_ssim, constant):
         shape = x.shape
         images = [
             z.detach().reshape(-1, shape[-3], shape[-2] * shape[-1]).contiguous().numpy() for z in (x, y)
@@ -94,23 +94,22 @@ class _Compare(torch.autograd.Function):
         slopes = np.empty((3, *images[0].shape) if with_slopes else (3, 0, 0, 0), images[0].dtype)
         parallel_for(_similarity, count * height, ROWS_PER_PIECE, *images, shape[-1], window, sums, slopes)
         ctx.save_for_backward(x, y)
-        ctx.rest = (shape[-1], window, slopes)
-        ctx.set_materialize_grads(False)
+        ctx.rest = (shape[-1], window, slopes, by_l1, by_ssim)
         l1, similarity = sums.sum(0) / max(images[0].size, 1)
-        return x.new_tensor(l1), x.new_tensor(similarity)
+        return x.new_tensor(by_l1 * l1 + by_ssim * similarity + constant)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, g_l1, g_similarity):
+    def backward(ctx, by_loss):
         x, y = ctx.saved_tensors
-        channels, window, slopes = ctx.rest
+        channels, window, slopes, *weights = ctx.rest
         images = [z.detach().reshape(slopes.shape[1:]).contiguous().numpy() for z in (x, y)]
         out = np.empty_like(images[0])
-        scales = np.array([float(g or 0) / max(out.size, 1) for g in (g_l1, g_similarity)], out.dtype)
+        scales = np.array([float(by_loss) * w / max(out.size, 1) for w in weights], out.dtype)
         parallel_for(
             _gradient, out.shape[0] * out.shape[1], ROWS_PER_PIECE, *images, channels, window, slopes, scales, out
         )  # fmt: skip
-        return torch.from_numpy(out).reshape(x.shape), None, None
+        return torch.from_numpy(out).reshape(x.shape), None, None, None, None, None
 
 
 @kernel(error_model="numpy")
