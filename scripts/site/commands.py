@@ -50,37 +50,46 @@ def make_page() -> str:
 
 
 def help_of(name: str, words: list[str]) -> str:
-    """What the command says of itself, one line per option and description."""
+    """What the command says of itself."""
     (found,) = entry_points(group="console_scripts", name=name)
     main = getattr(import_module(found.module), found.attr)
     out = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")  # tyro draws other boxes for other encodings
-    wide = mock.patch.dict(os.environ, {"COLUMNS": "4000", "NO_COLOR": "1"})
-    with wide, contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+    # Of more than 127 columns tyro makes two, whose boxes stand side by side.
+    narrow = mock.patch.dict(os.environ, {"COLUMNS": "120", "NO_COLOR": "1"})
+    with narrow, contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         main([*words, "--help"])
     out.flush()
     return out.buffer.getvalue().decode()
 
 
 def options(said: str) -> list[tuple[str, str]]:
-    """(option, description) of each row of the boxes."""
+    """(option, description) of each row of the boxes; what a box says of itself is left out."""
     rows: list[tuple[str, str]] = []
     for line in re.findall(r"^│ (.*?) *│$", said, re.M):
         if line.startswith(" ") and rows:
             rows[-1] = (rows[-1][0], f"{rows[-1][1]} {line.strip()}".strip())
-        elif line.strip("─ "):
-            option, _, text = line.strip().partition("  ")
+            continue
+        option, _, text = line.strip().partition("  ")
+        if re.fullmatch(r"-.*|\[.*\]|[A-Z]+", option):
             rows.append((option, text.strip()))
     return [(option, text.removesuffix("(default: None)").strip()) for option, text in rows]
 
 
 def render(said: str, known: set[str] = frozenset()) -> str:
-    """Usage, description and a list of the options that are not in `known`."""
-    usage, _, rest = said.partition("\n\n")
-    about = rest.partition("╭")[0].strip()
+    """Examples, usage, description and a list of the options that are not in `known`.
+
+    With `known` the options of a method are wanted, of which the command's examples say nothing.
+    """
+    examples, _, rest = said.partition("usage: ")
+    usage, _, rest = rest.partition("\n\n")
+    about = _escape(rest.partition("╭")[0].strip())
+    about = re.sub(r"^(method:\S+): (.*)\n(\n(?=method:))?", r"- `\1`: \2\n", about, flags=re.M)
+    shown = [] if known else re.findall(r"^  (\S.*)$", examples, re.M)
+    block = "\n".join([*shown, *([""] if shown else []), usage.strip()])
     rows = [(o, d) for o, d in options(said) if o not in known and not o.startswith("-h")]
     listed = "\n".join(f"`{option}`\n:   {_escape(text)}\n" for option, text in rows)
-    return f"```\n{usage.removeprefix('usage: ').strip()}\n```\n\n{_escape(about)}\n\n{listed}"
+    return f"```\n{block}\n```\n\n{about}\n\n{listed}"
 
 
 def _escape(text: str) -> str:
-    return re.sub(r"([<*_\[\]])", r"\\\1", text)
+    return re.sub(r"`[^`]*`|([<*_\[\]])", lambda m: m[0] if m[1] is None else f"\\{m[1]}", text)

@@ -70,6 +70,14 @@ def test_the_page_of_commands_has_every_command_and_option(part):
     assert rows["--seed INT"] == "Random seed. (default: 0)"
     page = commands.render(said, {"--seed INT"})
     assert "`--views INT`\n:   Number of training views" in page and "--seed" not in page
+    whole = commands.make_page()
+    assert "│" not in whole and "usage:" not in whole
+    assert "```\nvisdom-eval runs/SCENE/VIEWS/METHOD/SEED\n" in whole
+    settings = whole.partition("### visdom-train method:ingp+vd\n")[2].partition("\n## ")[0]
+    assert re.search(r"^`--method.steps INT`\n:   \w.*\(default: 800\)$", settings, re.M)
+    assert (
+        "for `few_views_share`" in settings and "`--data" not in settings and "`The settings" not in settings
+    )
 
 
 def test_the_page_of_messages_has_the_words_of_the_source(part):
