@@ -89,7 +89,17 @@ def test_a_typo_gets_the_nearest_name_and_all_names():
     with pytest.raises(ConfigError) as caught:
         registry.find("goud")
     assert "did you mean 'good'?" in caught.value.what
-    assert caught.value.todo == "choose one of: method:good, method:good+vd, method:fine"
+    assert caught.value.todo == "choose one of: method:good, method:good+vd"
+    assert caught.value.topic == "unknown-name"
+
+
+def test_of_many_methods_the_error_says_where_they_are_listed():
+    registry = Registry()
+    registry.add([_preset(f"method{i}") for i in range(13)], "many")
+    with pytest.raises(ConfigError) as caught:
+        registry.find("methud5")
+    assert "did you mean 'method5'?" in caught.value.what
+    assert "visdom-methods" in caught.value.todo and "method7" not in str(caught.value)
 
 
 def test_a_missing_class_names_the_method_and_the_target():

@@ -42,6 +42,8 @@ VARIABLE = "VISDOM_METHODS"
 HEAVY = ("torch", "numba", "cv2", "jax", "tensorflow", "nerfstudio", "gsplat")
 """What no package should import only to say its methods' names."""
 OURS = "visdom-plugin"
+_FEW = 12
+"""Methods that an error lists; of more it says where they are listed."""
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +112,7 @@ class Registry:
         """The preset of a name or alias.
 
         Raises:
-            ConfigError: for an unknown name, with the nearest and all available ones.
+            ConfigError: for an unknown name, with the nearest one.
         """
         base, plus, variant = name.partition("+")
         for known in (name, self.aliases.get(base, base) + plus + variant):
@@ -129,7 +131,10 @@ class Registry:
             cause=f"the methods of a package were skipped; `visdom-methods --doctor` tells why: {skipped}"
             if skipped
             else None,
-            todo="choose one of: " + ", ".join(f"method:{n}" for n in names),
+            todo=f"choose one of: {', '.join(f'method:{n}' for n in self.presets)}"
+            if len(names) <= _FEW
+            else "choose one of those that `visdom-methods` lists",
+            topic="unknown-name",
         )
 
 

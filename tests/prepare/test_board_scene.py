@@ -12,10 +12,12 @@ import torch
 
 from datamodules import load
 from visdom_plugin.cli.commands.prepare import main
+from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import project
 from visdom_plugin.prepare.board import corner_points, find_corners
 from visdom_plugin.prepare.demo import true_mask
 from visdom_plugin.prepare.settings import BoardSettings
+from visdom_plugin.prepare.write import find_earlier, read_record
 
 
 def hashes(folder) -> dict[str, str]:
@@ -89,6 +91,19 @@ def test_again_changes_nothing(photographs, prepared, capsys):
 
 
 def test_other_settings_are_refused_and_nothing_is_lost(photographs, prepared, capsys):
-    before = hashes(prepared)
-    assert main([str(photographs.folder), "--out", str(prepared), "--size", "400"]) == 2
-    assert "--overwrite" in capsys.readouterr().err and hashes(prepared) == before
+    before, size = hashes(prepared), read_record(prepared)["asked"]["settings"]["size"]
+    words = [str(photographs.folder), "--out", str(prepared), "--size", "400", "--mask-rounds", "1"]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "--overwrite" in said and hashes(prepared) == before
+    assert f"settings: size was {size}, now 400, rounds was " in said and "now 1" in said
+
+
+def test_other_photographs_are_named(photographs, prepared):
+    asked = read_record(prepared)["asked"]
+    one, two, *_ = asked["photographs"]
+    now = dict(asked["photographs"]) | {one: "0" * 64, "new.jpg": "1" * 64}
+    del now[two]
+    with pytest.raises(ConfigError, match=rf"photographs or settings: {one}, new\.jpg, {two}\n") as caught:
+        find_earlier(prepared, asked | {"photographs": now}, overwrite=False)
+    assert caught.value.topic == "other-run"

@@ -65,9 +65,17 @@ def test_too_little_of_the_board(photographs, folder, tmp_path, capsys):
     assert "the board can be used in 0 of 2 photographs" in said and "are needed" in said
 
 
+def test_one_photograph_is_too_few(photographs, folder, tmp_path, capsys):
+    folder.mkdir()
+    shutil.copy(photographs.folder / photographs.truths[0].name, folder)
+    said = refusal(folder, tmp_path, capsys)
+    assert "there is one photograph" in said and "take six or more" in said and "#no-board" in said
+
+
 @pytest.mark.parametrize(("markers", "cause"), [(3, "3 of its markers can be read"), (20, "try --legacy")])
 def test_markers_without_corners(markers, cause, folder, tmp_path, capsys, monkeypatch):
     save(folder, "a.jpg")
+    save(folder, "b.jpg")
     nothing = Corners(np.zeros(0, np.int64), np.zeros((0, 2)), markers)
     monkeypatch.setattr(from_board, "find_corners", lambda *_: nothing)
     assert cause in refusal(folder, tmp_path, capsys)

@@ -95,6 +95,8 @@ def test_bad_input_gets_one_clear_line(tmp_path, capsys):
         busy = str(taken.getsockname()[1])
         for words, said in (
             ([str(tmp_path / "nothing")], "there is no such"),
+            ([str(tmp_path / "nothing")], "what to do: name a run directory"),
+            ([str(tmp_path / "nothing")], "#no-scene"),
             ([str(tmp_path / "broken.ply")], "not a PLY point cloud"),
             (["--beside", str(tmp_path)], "two runs are compared"),
             (["--port", busy], f"port {busy}"),

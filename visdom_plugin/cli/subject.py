@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from datamodules.built_in import on_disk
 from visdom_plugin.cli.options import SceneOptions, read_options, resolve_device
 from visdom_plugin.errors import ConfigError
 
@@ -59,6 +60,22 @@ def is_splat_file(path: Path) -> bool:
 def is_run(path: Path) -> bool:
     """Whether a folder is a run directory."""
     return (path / "run.json").is_file()
+
+
+def refuse_missing(path: Path | None) -> None:
+    """Refuses a path at which there is nothing, before anything is loaded; built-in scenes have none.
+
+    Raises:
+        ConfigError: there is no such file or folder.
+    """
+    place = on_disk(path)
+    if place is not None and not place.exists():
+        raise ConfigError(
+            "there is no such file or folder",
+            where=path,
+            todo="name a run directory, as visdom-train does at its end, a file of Gaussians, or a scene's folder",
+            topic="no-scene",
+        )
 
 
 def open_subject(path: Path, options: SceneOptions, device: str, *, test: bool) -> Subject:

@@ -126,6 +126,16 @@ _TELLING = 3
 
 
 @contextmanager
+def showing(text: Callable[[], str]) -> Iterator[None]:
+    """A block that may take seconds, shown by a line that is asked for again and again."""
+    screen.begin(text)
+    try:
+        yield
+    finally:
+        screen.end(text)
+
+
+@contextmanager
 def phase(name: str) -> Iterator[None]:
     """A block that may take seconds, shown with how long it has taken; usable as a decorator.
 
@@ -133,15 +143,8 @@ def phase(name: str) -> Iterator[None]:
         name: such as "reading the scene".
     """
     began = time.monotonic()
-
-    def text() -> str:
-        return f"{name}: {time.monotonic() - began:.0f} s"
-
-    screen.begin(text)
-    try:
+    with showing(lambda: f"{name}: {time.monotonic() - began:.0f} s"):
         yield
-    finally:
-        screen.end(text)
 
 
 @contextmanager
@@ -158,14 +161,8 @@ def counting(name: str, total: int) -> Iterator[Callable[[_T], _T]]:
         done = next(numbers)
         return result
 
-    def text() -> str:
-        return describe_parts(name, done, total, time.monotonic() - began)
-
-    screen.begin(text)
-    try:
+    with showing(lambda: describe_parts(name, done, total, time.monotonic() - began)):
         yield finished
-    finally:
-        screen.end(text)
 
 
 def describe_parts(name: str, done: int, total: int, took: float) -> str:

@@ -32,6 +32,13 @@ def place_by_board(
     Raises:
         SceneError: no board, another board, too few views of it, or photographs of several cameras.
     """
+    if len(photographs) < 2:
+        raise SceneError(
+            "there is one photograph, which does not tell where its camera was and what lens it has",
+            where=photographs[0].path,
+            todo="take six or more, from all round the object",
+            topic="no-board",
+        )
     require_one_camera(photographs)
     every = range(len(photographs))
     with counting("looking for the board in the photographs", len(photographs)) as count:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from visdom_plugin.atomic_files import MARK, write_json
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, list_some
 from visdom_plugin.export.dataset import write_transforms
 from visdom_plugin.figures.contact_sheet import write_png
 from visdom_plugin.geometry.cameras import Cameras
@@ -56,15 +56,27 @@ def find_earlier(out: Path, asked: dict[str, Any], overwrite: bool) -> list[str]
     if overwrite:
         return None
     if record.get("asked") != asked:
-        differs = [k for k in asked if record.get("asked", {}).get(k) != asked[k]]
+        changes = list_some(_changes(record["asked"], asked), 4)
         raise ConfigError(
-            f"this folder holds a scene made of other photographs or settings ({', '.join(differs) or 'version'})",
+            f"this folder holds a scene made of other photographs or settings: {changes}",
             where=f"--out {out}",
             todo="name another folder, or pass --overwrite to make this one anew",
             topic="other-run",
         )
     written: dict[str, str] = record.get("written", {})
     return [n for n, digest in written.items() if not (out / n).is_file() or hash_file(out / n) != digest]
+
+
+def _changes(before: Any, now: Any, name: str = "") -> list[str]:
+    """What was asked for otherwise then, by name; of photographs and files, which."""
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        files = any(isinstance(v, str) and len(v) == 64 for v in (before, now))
+        return [name if files else f"{name} was {before}, now {now}"] if before != now else []
+    return [
+        change
+        for key in dict.fromkeys([*now, *before])
+        for change in _changes(before.get(key), now.get(key), key)
+    ]
 
 
 def read_record(out: Path) -> dict[str, Any] | None:

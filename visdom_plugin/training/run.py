@@ -338,7 +338,7 @@ def assess(
     elif hull is not None and getattr(config, "hull", None) == VisibleDomain():
         reference = hull
     elif (reference := read_hull(run_dir / "hull" / REFERENCE)) is None:
-        log.info("the metric 'opacity outside the hull' needs the hull that is the same for every method:")
+        log.info("carving the reference hull for the metrics, the same for every method")
         with phase("carving the reference hull"):
             reference = carve_reference(scene.train)
         if reference is not None:

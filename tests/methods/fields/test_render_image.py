@@ -1,9 +1,9 @@
 """Pictures of fields: ray by ray in pieces, however large."""
 
-import logging
-
+import pytest
 import torch
 
+from visdom_plugin.compute import waiting
 from visdom_plugin.geometry.camera_paths import look_at_camera
 from visdom_plugin.geometry.cameras import Cameras, rays_of
 from visdom_plugin.methods.fields import common
@@ -52,14 +52,15 @@ def test_no_more_than_a_chunk_of_rays_exists_at_a_time():
     assert max(kept for _, kept in sizes) <= 64
 
 
-def test_a_long_view_says_how_long(monkeypatch, caplog):
-    monkeypatch.setattr(common, "SPEAK_AFTER", -1.0)
-    with caplog.at_level(logging.INFO):
-        render_image(camera(), show, FRAME, 64)
-    (line,) = [r.getMessage() for r in caplog.records]
-    assert line.startswith("a view of 37 x 23 pixels takes about ")
-    caplog.clear()
-    monkeypatch.setattr(common, "SPEAK_AFTER", 1000.0)
-    with caplog.at_level(logging.INFO):
-        render_image(camera(), show, FRAME, 64)
-    assert not caplog.records
+@pytest.mark.parametrize(("after", "shown"), [(-1.0, True), (1000.0, False)])
+def test_of_a_long_view_the_screen_shows_how_far_it_is(monkeypatch, after, shown):
+    begun, ended = [], []
+    monkeypatch.setattr(common, "SPEAK_AFTER", after)
+    monkeypatch.setattr(waiting.screen, "begin", lambda text: begun.append((text, text())))
+    monkeypatch.setattr(waiting.screen, "end", ended.append)
+    render_image(camera(), show, FRAME, 64)
+    assert len(begun) == len(ended) == shown
+    if shown:
+        ((text, first),) = begun
+        assert first.startswith("drawing a view of 37 x 23 pixels: 1 of 14, ")
+        assert text().startswith("drawing a view of 37 x 23 pixels: 14 of 14, ") and ended == [text]

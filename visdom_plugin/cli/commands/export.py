@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from datamodules.built_in import PREFIX, on_disk
+from datamodules.built_in import PREFIX
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.options import Device, SceneOptions, read_options
 from visdom_plugin.cli.output.terminal import load_torch, say
-from visdom_plugin.cli.subject import PointCloud, Subject, is_run, is_splat_file, open_subject
+from visdom_plugin.cli.subject import PointCloud, Subject, is_run, is_splat_file, open_subject, refuse_missing
 from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import ConfigError
 
@@ -97,8 +97,7 @@ def _export(argv: Sequence[str]) -> None:
 
 def _check(options: Options) -> None:
     """Refuses what cannot go together, before anything is read."""
-    if (place := on_disk(options.run)) is not None and not place.exists():
-        raise ConfigError("there is no such file or folder", where=options.run)
+    refuse_missing(options.run)
     if options.mesh and options.format not in MESHES:
         raise ConfigError(f"--mesh is for {', '.join(MESHES)}", where=f"--format {options.format}")
     if not 8 <= options.resolution <= 1024:

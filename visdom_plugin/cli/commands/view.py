@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from datamodules.built_in import on_disk
 from visdom_plugin.cli import entry
 from visdom_plugin.cli.options import Device, SceneOptions, read_options
 from visdom_plugin.cli.output.terminal import load_torch, say
-from visdom_plugin.cli.subject import PointCloud, is_run, is_splat_file, open_subject
+from visdom_plugin.cli.subject import PointCloud, is_run, is_splat_file, open_subject, refuse_missing
 from visdom_plugin.errors import CheckpointError, ConfigError
 from visdom_plugin.viewer.serve import choose_port, describe_address, require_viser
 
@@ -60,8 +59,7 @@ def _view(argv: Sequence[str]) -> None:
     require_viser()
     if what is not None and options.wait:
         wait_for_state(what)
-    if (place := on_disk(what)) is not None and not place.exists():
-        raise ConfigError("there is no such file or folder", where=what)
+    refuse_missing(what)
     choose_port(options.host, options.port)
     load_torch()
     from visdom_plugin.viewer.app import Viewer

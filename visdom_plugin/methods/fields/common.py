@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from visdom_plugin.compute.waiting import describe_parts, showing
 from visdom_plugin.geometry.cameras import Cameras, rays_of
 from visdom_plugin.geometry.mesh_files import mesh_ply
 from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook
@@ -25,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 SPEAK_AFTER = 5.0
-"""Seconds after which a view that takes as long again is announced."""
+"""Seconds after which the screen shows how far a view is that takes as long again."""
 MESH_RESOLUTION = 160
 """Voxels along the longest side of what `mesh_density` looks at."""
 
@@ -131,21 +133,30 @@ def render_image(
     width, height = camera.size
     device = camera.intrinsics.device
     rgb, alpha, depth = (torch.empty(width * height, *tail, device=device) for tail in ((3,), (), ()))
-    started, said = time.perf_counter(), False
-    for first in range(0, width * height, chunk):
-        pixels = torch.arange(first, min(first + chunk, width * height), device=device)
-        uv = torch.stack([pixels % width, pixels // width], -1).to(camera.intrinsics) + 0.5
-        origins, directions = rays_of(camera, uv)
-        with torch.no_grad():
-            colour, opacity, distance = render_rays(origins, directions)
-        along = (directions @ camera.forward).float()
-        part = slice(first, first + len(pixels))
-        rgb[part], alpha[part] = colour, opacity
-        depth[part] = torch.where(opacity > 0, distance * along / frame.scale, 0)
-        spent, share = time.perf_counter() - started, (first + len(pixels)) / (width * height)
-        if not said and spent > SPEAK_AFTER and spent / share - spent > SPEAK_AFTER:
-            said = True
-            log.info("a view of %d x %d pixels takes about %.0f s", width, height, spent / share)
+    firsts = range(0, width * height, chunk)
+    began, done, said = time.monotonic(), 0, False
+
+    def how_far() -> str:
+        took = time.monotonic() - began
+        return describe_parts(f"drawing a view of {width} x {height} pixels", done, len(firsts), took)
+
+    with ExitStack() as shown:
+        for first in firsts:
+            pixels = torch.arange(first, min(first + chunk, width * height), device=device)
+            uv = torch.stack([pixels % width, pixels // width], -1).to(camera.intrinsics) + 0.5
+            origins, directions = rays_of(camera, uv)
+            with torch.no_grad():
+                colour, opacity, distance = render_rays(origins, directions)
+            along = (directions @ camera.forward).float()
+            part = slice(first, first + len(pixels))
+            rgb[part], alpha[part] = colour, opacity
+            depth[part] = torch.where(opacity > 0, distance * along / frame.scale, 0)
+            done += 1
+            spent = time.monotonic() - began
+            left = spent / done * (len(firsts) - done)
+            if not said and spent > SPEAK_AFTER and left > SPEAK_AFTER:
+                said = True
+                shown.enter_context(showing(how_far))
     shape = (height, width)
     return Render(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape))
 

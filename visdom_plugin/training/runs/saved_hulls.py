@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from visdom_plugin.atomic_files import appearing
+from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import CheckpointError, ConfigError
 from visdom_plugin.scene import Views
 
@@ -47,7 +48,8 @@ def _find_inner(config: Any, hull: Hull, views: Views, saved: Path | None) -> Hu
         try:
             images = [views.images[i] for i in views.with_masks()]
             cameras, masks, ignore = views.silhouettes()
-            inner = shape_inside(hull, cameras, masks, ignore, config.inside, images)
+            with phase("finding the shape inside the hull"):
+                inner = shape_inside(hull, cameras, masks, ignore, config.inside, images)
         except ConfigError as error:
             log.warning("training goes by the hull alone, not by the shape inside it: %s", error.what)
     return inner
