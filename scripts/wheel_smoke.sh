@@ -114,6 +114,8 @@ for method in zipnerf+vd visdom-gs; do
     || { cat train.txt; exit 1; }
 done
 "$bin/python" - <<'PY'
+from importlib.metadata import version
+
 import visdom_plugin as vd
 
 assert not [name for name in vd.__all__ if getattr(vd, name) is None]
@@ -125,6 +127,7 @@ for method in ("zipnerf+vd", "visdom-gs"):
     print(f"{method}: {trained:.2f} dB after 20 steps, and again from its checkpoint")
 assert (run.path / "export" / "point_cloud.ply").exists()
 print(f"all {len(vd.__all__)} public names of visdom_plugin {vd.__version__}")
+print(", ".join(f"{name} {version(name)}" for name in ("torch", "numpy", "numba", "tyro")))
 PY
 if [ -n "$out" ]; then
   cp "$work"/dist/* "$out/"

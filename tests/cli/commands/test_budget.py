@@ -7,6 +7,7 @@ import pytest
 from tests.training import fake
 from visdom_plugin import registry
 from visdom_plugin.cli.commands import train
+from visdom_plugin.geometry.cameras import Cameras
 
 
 @pytest.mark.parametrize("views, warned", [("4", True), ("6", False)])
@@ -34,7 +35,9 @@ def test_standard_with_too_few_views_is_said(views, warned, tmp_path, monkeypatc
     ("size", "asked", "factor"), [((300, 799), 1, None), ((1600, 1200), 1, 4), ((600, 801), 2, 4)]
 )
 def test_photographs_too_large_for_a_quick_schedule_are_told_of(size, asked, factor):
-    note = train._describe_size(fake.tiny_scene().train.cameras.resized(*size), asked)
+    cameras = fake.tiny_scene().train.cameras.resized(*size)
+    turned = Cameras.stack([cameras[0], cameras[1].resized(*size[::-1]), cameras[2]])
+    note = train._describe_size(turned, asked)
     assert (note is None) == (factor is None)
     if note is not None:
         assert note.endswith(f"--downscale {factor}") and f"{size[0]} x {size[1]} pixels" in note

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -82,7 +83,7 @@ def _train(argv: Sequence[str]) -> None:
 
 def _describe_size(cameras: Cameras, downscale: float) -> str | None:
     """What to say of pictures that are too large for quick schedules; None of others."""
-    width, height = (int(size.max()) for size in (cameras.width, cameras.height))
+    width, height = max((camera.size for camera in (cameras[i] for i in range(len(cameras)))), key=math.prod)
     factor = swift_factor(downscale, max(width, height))
     if factor == downscale:
         return None
