@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 import visdom_plugin
+from visdom_plugin.registry import installed
 
 ROOT = Path(__file__).parents[2]
 API = (ROOT / "docs/api.md").read_text(encoding="utf-8")
@@ -78,6 +79,14 @@ def test_the_page_of_commands_has_every_command_and_option(part):
     assert (
         "for `few_views_share`" in settings and "`--data" not in settings and "`The settings" not in settings
     )
+
+
+@pytest.mark.parametrize("method", sorted(n for n in installed().presets if not n.endswith("+mask")))
+def test_every_option_is_described(part, method):
+    commands = part("commands")
+    found = commands.options(commands.help_of("visdom-train", [f"method:{method}"]))
+    assert len(found) > 30
+    assert [option for option, text in found if not re.match(r"[\w`]", text)] == []
 
 
 def test_the_page_of_messages_has_the_words_of_the_source(part):

@@ -36,15 +36,22 @@ class GaussianSetConfig:
     lr_means_final: float = 1.6e-6
     """Reached, log-linearly, after `lr_means_steps` steps."""
     lr_means_steps: int = 30_000
+    """Steps after which `lr_means_final` is reached."""
     lr_sh: float = 0.0025
     """Colour; the higher harmonics learn at a twentieth."""
     lr_opacity: float = 0.05
+    """Learning rate of the opacities' logits."""
     lr_scale: float = 0.005
+    """Learning rate of the logarithms of the scales."""
     lr_rotation: float = 0.001
+    """Learning rate of the quaternions."""
 
     densify_from: int = 500
+    """Step after which Gaussians are cloned, split and pruned."""
     densify_until: int = 15_000
+    """Step at which this ends."""
     densify_every: int = 100
+    """It happens on every n-th step."""
     densify_gradient: float = 0.0002
     """Mean norm of the loss's gradient by the projected mean, in normalised device units (image = [-1, 1])."""
     densify_scale: float = 0.01

@@ -61,7 +61,9 @@ class IngpConfig(FieldConfig):
     """Behind the photograph in training. Random colours need the masks as alpha: a silhouette signal."""
 
     half_side: float = 1.0
+    """Half the side of the cube that the field fills."""
     near: float = 0.05
+    """Distance from the camera at which rays begin."""
     step_length: float = 0.004
     """Between two samples of a ray, where the occupancy grid leaves any."""
     missing_step_length: float = 0.032
@@ -80,18 +82,22 @@ class IngpConfig(FieldConfig):
     """density = exp(x + bias), per camera distance."""
 
     occupancy_resolution: int = 128
+    """Cells of the occupancy grid along each axis."""
     occupancy_every: int = 16
     """Steps between two updates of the occupancy grid."""
     occupancy_warm_up: int = 256
     """Until this step, updates look at all cells; later at a quarter, and at as many occupied ones."""
     occupancy_fraction: float = 0.25
+    """Share of all cells that an update looks at after the warm-up."""
     occupancy_alpha: float = 0.01
     """Cells whose density gives less opacity than this over one step length are skipped."""
     drop_unsampled: bool = True
     """Cells that no training ray samples, given its bounds, stay empty for ever (Instant-NGP: that none sees)."""
 
     lr: float = 0.01
+    """Learning rate."""
     lr_warm_up: int = 100
+    """Steps in which the learning rate rises to its full value."""
     lr_factor: float = 0.33
     """The learning rate falls by this factor at 50, 75 and 90 % of the schedule (nerfacc)."""
     weight_decay: float = 1e-6
@@ -138,6 +144,7 @@ class ZipNerfConfig(FieldConfig):
     """Behind the photograph in training. Random colours need the masks as alpha: a silhouette signal."""
 
     near: float = 0.05
+    """Distance from the camera at which rays begin."""
     far: float = 1e6
     """Space beyond the cameras is contracted into a ball of radius 2."""
     spacing_power: float = -1.5
@@ -165,6 +172,7 @@ class ZipNerfConfig(FieldConfig):
     bottleneck: int = 256
     """Numbers handed from the density network to the colour network."""
     colour_hidden: int = 256
+    """Width of the colour network's hidden layers."""
     colour_layers: int = 3
     """Hidden layers of the colour network; its input joins again before the last of them."""
     view_degree: int = 4
@@ -173,12 +181,15 @@ class ZipNerfConfig(FieldConfig):
     """density = exp(x + bias), per camera distance."""
 
     interlevel_weight: float = 0.01
+    """Of the loss that pulls the proposals' weights towards the field's."""
     distortion_weight: float = 0.01
+    """Of the loss that gathers the weights along a ray (mip-NeRF 360)."""
     hash_decay: float = 0.1
     """Times the mean squares of the tables, summed over levels and grids."""
     blur: tuple[float, float] = (0.03, 0.003)
     """Half widths of the interlevel loss, in normalised distance."""
     anneal_slope: float = 10.0
+    """How fast proposals sharpen over the schedule (mip-NeRF 360)."""
     proposal_mask_share: float = 0.0
     """What the silhouette loss of each proposal weighs, as a share of the field's; 0.1 in the release."""
     mask_clamp: float = 1e-6
@@ -186,9 +197,13 @@ class ZipNerfConfig(FieldConfig):
     Nearer there is no gradient: a field that starts emptier may stay empty."""
 
     lr: float = 0.00125
+    """Learning rate."""
     lr_final: float = 0.000125
+    """Learning rate at the end, reached log-linearly."""
     lr_warm_up: int = 20_000
+    """Steps in which the learning rate rises to its full value."""
     lr_delay: float = 1e-8
+    """Share of the learning rate with which the warm-up begins."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -229,16 +244,19 @@ class ZeroRfConfig(FieldConfig):
     rays: int = 1 << 16
     """Pixels per step from the second of `rays_grow_at` on."""
     rays_grow_at: tuple[int, int] = (50, 100)
+    """Steps at which the number of pixels per step grows."""
     background: Literal["white", "random"] = "white"
     """Behind the photograph in training. Random colours need the masks as alpha: a silhouette signal."""
     compare_alpha: bool = True
     """Let the mean squared error compare opacity with the mask as a fourth channel, as the original does where
     photographs come with alpha. False compares colours alone."""
     mse_weight: float = 3.2
+    """Of the mean squared error."""
 
     fit_margin: float = 0.1
     """Room around the object in the cube, as a share of its half side."""
     near: float = 0.2
+    """Distance from the camera at which rays begin."""
     step_length: float = 0.0034
     """Between two samples of a ray, where the occupancy grid leaves any."""
     missing_step_length: float = 0.027
@@ -251,6 +269,7 @@ class ZeroRfConfig(FieldConfig):
     dif_period: float = 0.4
     """After which the second volume of "dif" repeats; the original calls it a frequency."""
     noise_channels: int = 8
+    """Channels of the frozen noise."""
     noise_resolution: int = 20
     """Along each side of the frozen noise: about a fortieth of the photographs' pixels. Planes and lines are 16
     times as fine, volumes 8 times."""
@@ -266,11 +285,13 @@ class ZeroRfConfig(FieldConfig):
     """density = exp(x + bias), per half side."""
 
     occupancy_resolution: int = 64
+    """Cells of the occupancy grid along each axis."""
     occupancy_every: int = 1
     """Steps between two updates of the occupancy grid."""
     occupancy_warm_up: int = 0
     """Until this step, updates look at all cells; later at `occupancy_fraction`, and at as many occupied ones."""
     occupancy_fraction: float = 1.0
+    """Share of all cells that an update looks at after the warm-up."""
     occupancy_density: float = 0.05
     """Cells with less density than this, and than the mean, are skipped in training."""
     test_occupancy_density: float = 0.01
@@ -279,8 +300,11 @@ class ZeroRfConfig(FieldConfig):
     """Cells that no training ray samples, given its bounds, stay empty for ever."""
 
     lr: float = 0.002
+    """Learning rate."""
     betas: tuple[float, float] = (0.9, 0.98)
+    """Of Adam: decay of its two moments."""
     weight_decay: float = 0.2
+    """Of AdamW."""
     gradient_clip: float = 1.0
     """Largest norm of all gradients together."""
 

@@ -112,6 +112,7 @@ class RepairConfig:
     """How far from the middle between two neighbours they may stand: 0 for there alone, 1 from a quarter to
     three quarters of the way."""
     ddim_steps: int = 50
+    """Steps of DDIM in which a view is repaired."""
     strength: Range = (0.1, 1.0)
     """How far towards pure noise a render is taken before it is denoised, drawn for each."""
     guidance: float = 1.0
@@ -122,7 +123,9 @@ class RepairConfig:
     """Weight of a repaired view, 1 - alpha_bar of the noise it started from. The authors' code looks the
     DDIM step up in the table of the 1,000 training steps, which gives at most 0.05."""
     l1_weight: float = 0.5
+    """Of the mean absolute difference to a repaired view."""
     l2_weight: float = 0.5
+    """Of the mean squared difference to a repaired view."""
     lpips_weight: float = 2.0
     """Off where the package lpips or its VGG weights are not there; the run says so."""
     domain: bool = False
@@ -130,14 +133,21 @@ class RepairConfig:
     hull are removed. The VisDom authors' release has them in the coarse stage only."""
 
     lr_means: float = 1.6e-6
+    """Learning rate of the positions in this stage, times the scene extent."""
     densify_gradient: float = 3e-6
+    """Threshold of densification in this stage, as `densify_gradient` of the coarse one."""
     densify_from: int = 400
+    """Step after which Gaussians are cloned, split and pruned in this stage."""
     densify_until: int = 3_600
+    """Step at which this ends."""
     densify_every: int = 100
+    """It happens on every n-th step."""
     prune_opacity: float = 0.02
+    """Densification removes Gaussians below it."""
     prune_large_from: int = 300
+    """From this step on Gaussians that are too large are removed."""
     opacity_reset_every: int = 500
-    """Gaussians' options of this stage, see those of the coarse one."""
+    """Opacities fall to 0.01 on every n-th step of this stage; 0 never."""
     fewest_gaussians: int = 10_000
     """Of so many or fewer none is removed for being faint or large."""
 

@@ -63,6 +63,7 @@ class GsGoConfig(HullStartConfig):
     lr_means_steps: int = 30_000
     """GaussianObject keeps 3DGS's 30,000 although it runs 10,000."""
     densify_until: int = 6_000
+    """Step at which cloning, splitting and pruning ends."""
 
     depth_weight: float = 0.0005
     """Shift- and scale-free L1 on disparities, where the scene comes with monocular depth."""
@@ -122,6 +123,7 @@ class CorgsConfig(HullStartConfig):
     pseudo_views: Literal["ellipse", "between"] = "ellipse"
     """Unseen views in which the sets are compared: on an ellipse fitted to the cameras, or between two of them."""
     pseudo_from: int = 500
+    """First step with a pseudo view."""
     pseudo_until: int = 30_000
     """Last step with a pseudo view."""
     pseudo_every: int = 1

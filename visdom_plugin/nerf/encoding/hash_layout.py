@@ -22,10 +22,15 @@ class HashLayout:
     """
 
     levels: int = 8
+    """Grids, from coarse to fine."""
     features: int = 2
+    """Numbers at each vertex of a level."""
     base_resolution: int = 16
+    """Cells along each axis of the coarsest level."""
     max_resolution: int = 512
+    """Cells along each axis of the finest level."""
     log2_table_size: int = 15
+    """Rows of each level's table are at most 2 to the power of this."""
 
     def __post_init__(self):
         if self.levels < 1 or self.features < 1:

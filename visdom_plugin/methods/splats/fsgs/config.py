@@ -23,7 +23,9 @@ class FsgsConfig(HullStartConfig):
     sh_every: int = 500
     """Steps between two degrees; training starts at degree 0."""
     lr_means_steps: int = 10_000
+    """Steps after which `lr_means_final` is reached."""
     densify_until: int = 10_000
+    """Step at which cloning, splitting and pruning ends."""
     densify_gradient: float = 0.0005
     """Mean norm of the loss's gradient by the projected mean, in normalised device units (image = [-1, 1])."""
     opacity_reset_from: int = 2_001

@@ -26,21 +26,26 @@ class SplatFieldsConfig(HullStartConfig):
     sh_degree: int = 0
     """The field's colours look alike from all sides."""
     densify_until: int = 40_000
+    """Step at which cloning, splitting and pruning ends."""
 
     noise_channels: int = 8
+    """Channels of the frozen noise that planes are made of."""
     noise_size: int = 20
     """Pixels along a side of the frozen noise; the three planes made of it have sixteen times as many."""
     plane_channels: int = 16
+    """Features of each plane."""
     decoder_width: int = 32
     """Channels inside the network that makes a plane."""
     mlp_depth: int = 4
     """Hidden layers between the planes' features and the Gaussian's attributes."""
     mlp_width: int = 128
+    """Width of these layers."""
     lr_field: float = 8e-4
     """Of the networks: 5 x 1.6e-4."""
     lr_field_final: float = 1.6e-6
     """Reached, log-linearly, after `lr_field_steps` steps."""
     lr_field_steps: int = 40_000
+    """Steps after which `lr_field_final` is reached."""
 
     mask_l1_weight: float = 0.1
     """Mean absolute difference between rendered opacity and mask."""
