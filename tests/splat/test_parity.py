@@ -57,6 +57,28 @@ def test_equals_twin_in_float64(scene, camera):
         )
 
 
+@pytest.mark.parametrize("output", ["rgb", "alpha", "depth"])
+def test_the_gradient_of_one_output_equals_the_twins(output):
+    camera, background = (
+        make_camera(**CAMERAS["off centre, odd size"]),
+        torch.tensor([0.2, 0.5, 0.9]).double(),
+    )
+    fast, slow = make_gaussians(n=60), make_gaussians(n=60)
+    ours = getattr(rasterise(fast, camera, background, near=0.01), output)
+    theirs = dict(zip(("rgb", "alpha", "depth"), rasterise_twin(slow, camera, background), strict=False))[
+        output
+    ]
+    for value in (ours, theirs):
+        value.square().sum().backward()
+    for name in PARAMETERS:
+        expected = getattr(slow, name).grad
+        expected = torch.zeros_like(getattr(slow, name)) if expected is None else expected
+        scale = max(1, expected.abs().max().item())
+        torch.testing.assert_close(
+            getattr(fast, name).grad, expected, rtol=1e-10, atol=1e-11 * scale, msg=name
+        )
+
+
 @pytest.mark.parametrize("scene", SCENES)
 def test_equals_twin_in_float32(scene):
     """A pixel whose alpha rounds to the other side of 1/255 may differ by that much; all others are tight."""

@@ -144,9 +144,9 @@ class _Blend(torch.autograd.Function):
     def backward(ctx, g_rgb, g_alpha, g_depth):
         splats, background, alpha, depth = _arrays(*ctx.saved_tensors)
         tiles = ctx.tiles
-        shapes = ((*alpha.shape, 3), alpha.shape, alpha.shape)
         outer = [
-            _or_zeros(g, shape, alpha) for g, shape in zip((g_rgb, g_alpha, g_depth), shapes, strict=True)
+            _or_zeros(g, shape, alpha)
+            for g, shape in ((g_rgb, (*alpha.shape, 3)), (g_alpha, (0, 0)), (g_depth, (0, 0)))
         ]
         sums = np.empty((len(tiles.slots), blending.SUMS), alpha.dtype)
         parallel_for(

@@ -132,7 +132,7 @@ def blend_backward(
 
     Going back to front, T becomes the transmittance in front of a Gaussian and BEHIND the loss's gradient carried
     by all that lies behind. With q the gradient along its colour and depth, dL/dalpha is
-    T q - BEHIND / (1 - alpha).
+    T q - BEHIND / (1 - alpha). Where g_alpha or g_depth is empty it is zero.
     """
     height, width = alpha.shape
     real = alpha.dtype.type
@@ -155,8 +155,8 @@ def blend_backward(
                 t, opaque, gz = transmittance[y, x], alpha[y, x], zero
                 s[p + T], s[p + END] = t, ends[y, x]
                 # depth = z summed / alpha, and alpha = 1 - T; T also carries the background.
-                by_t = -g_alpha[y, x]
-                if opaque > zero:
+                by_t = -g_alpha[y, x] if g_alpha.size else zero
+                if g_depth.size and opaque > zero:
                     gz = g_depth[y, x] / opaque
                     by_t += gz * depth[y, x]
                 for channel in range(3):
