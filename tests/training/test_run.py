@@ -202,7 +202,7 @@ def test_evaluation_says_its_size_and_how_far_it_is(train, capsys, caplog, scene
         train(quiet=False)
     size = f"{int(scene.test.cameras.width[0])} x {int(scene.test.cameras.height[0])}"
     assert f"evaluation: {len(scene.test)} test views of {size} pixels" in caplog.text
-    assert caplog.text.index("opacity outside the hull") < caplog.text.index("evaluation:")
+    assert caplog.text.index("carving the reference hull") < caplog.text.index("evaluation:")
     n = len(scene.test)
     assert f"test view {n}/{n}  0 s left" in capsys.readouterr().err
 

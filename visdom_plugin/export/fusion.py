@@ -14,6 +14,7 @@ import torch
 
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
+from visdom_plugin.compute.waiting import counting
 from visdom_plugin.export.meshes import Mesh
 from visdom_plugin.geometry.camera_paths import look_at_camera
 from visdom_plugin.geometry.cameras import Cameras
@@ -207,10 +208,13 @@ def fuse(
     volume = Volume(bounds, resolution, inside)
     around = surround(cameras, torch.as_tensor(np.asarray(bounds).mean(0)), VIEWS, PICTURE_PX)
     black = torch.zeros(3, device=device)
-    for camera in (*(cameras[i] for i in range(len(cameras))), *(around[i] for i in range(VIEWS))):
-        with torch.no_grad():
-            render = renderer.render(camera.to(device), black)
-        alpha = render.alpha.float().cpu().numpy()
-        rgb = render.rgb.float().cpu().numpy() / np.maximum(alpha, 1e-3)[..., None]
-        volume.add(camera, render.depth.float().cpu().numpy(), alpha, rgb)
+    looked_from = [*(cameras[i] for i in range(len(cameras))), *(around[i] for i in range(VIEWS))]
+    with counting("fusing depth from all round", len(looked_from)) as count:
+        for camera in looked_from:
+            with torch.no_grad():
+                render = renderer.render(camera.to(device), black)
+            alpha = render.alpha.float().cpu().numpy()
+            rgb = render.rgb.float().cpu().numpy() / np.maximum(alpha, 1e-3)[..., None]
+            volume.add(camera, render.depth.float().cpu().numpy(), alpha, rgb)
+            count(camera)
     return volume.surface()
