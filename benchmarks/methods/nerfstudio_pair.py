@@ -86,10 +86,8 @@ def main() -> None:
         where = ["--output-dir", str(options.out), "--experiment-name", name, "--timestamp", stamp]
         seconds = call(training.entrypoint, [*words, *shlex.split(options.extra), *where, *parsing])
         run = options.out / name / words[1] / stamp
-        call(
-            evaluating.entrypoint,
-            ["ns-eval", "--load-config", str(run / "config.yml"), "--output-path", str(run / "eval.json")],
-        )
+        words = ["ns-eval", "--load-config", str(run / "config.yml"), "--output-path", str(run / "eval.json")]
+        call(evaluating.entrypoint, [*words, "--render-output-path", str(run / "views")])
         results = json.loads((run / "eval.json").read_text())["results"]
         rows.append((method, results["psnr"], results["ssim"], seconds))
     views = load(

@@ -56,16 +56,17 @@ def compare(
         titles: of the runs, by method.
     """
     names = picture_names(scene.test.names)
-    columns = [("truth", [_on_white(scene.test, i) for i in shown])]
+    columns = [("truth", [on_white(scene.test, i) for i in shown])]
     for run in runs:
         record = read_record(run)
         psnr = record["metrics"]["test"]["psnr"]
         pictures = [cv2.imread(str(run / "renders/test" / f"{names[i]}.png"))[..., ::-1] for i in shown]
         columns.append((f"{titles[record['method']]}\n{psnr:.1f} dB", pictures))
-    return draw([_on_white(scene.train, i) for i in range(len(scene.train))], columns)
+    return draw([on_white(scene.train, i) for i in range(len(scene.train))], columns)
 
 
-def _on_white(views: Views, index: int) -> np.ndarray:
+def on_white(views: Views, index: int) -> np.ndarray:
+    """(H, W, 3) uint8: a photograph without its background."""
     return to_bytes(whiten(views.images[index], views.masks[index]))
 
 
