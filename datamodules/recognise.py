@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -55,6 +56,9 @@ FORMATS = {
     "llff": _Format("llff", "poses_bounds.npy and images"),
 }
 """Names for --data-format."""
+
+REPEATED_BY = "repeated_by"
+"""Key of a transforms.json that names a COLMAP model beside it with the same cameras, as `visdom-export` does."""
 
 _ELSEWHERE = {
     "meta_data.json": "SDFStudio's, which is not read: write its camtoworld and intrinsics into a transforms.json "
@@ -191,10 +195,17 @@ def recognise(root: Path) -> dict[str, str]:
                 found[name] = reason
     covered = {name for other in found for name in FORMATS[other].covers}
     if {"nerfstudio", "colmap"} <= found.keys():
-        from datamodules.layouts.transforms import is_repeated
-
         covered |= {"colmap"} if is_repeated(root) else set()
     return {name: reason for name, reason in found.items() if name not in covered}
+
+
+def is_repeated(root: Path) -> bool:
+    """Whether transforms.json says that the COLMAP model beside it holds the same cameras."""
+    try:
+        content = json.loads((root / "transforms.json").read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and isinstance(content.get(REPEATED_BY), str)
 
 
 def read_capture(root: Path, data_format: str | None, request: Request) -> Capture:

@@ -14,7 +14,6 @@ dialect is read, too: a matrix of intrinsics per frame, and OpenCV's axes where 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -38,10 +37,6 @@ _LENS = ("x_fov", "y_fov", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "
 _LEAST_FOV = 2.5
 """Degrees; no smaller angle of view is believed, as it would be a wide one in radians."""
 _BENT = ("k1", "k2", "k3", "k4", "p1", "p2")
-
-
-REPEATED_BY = "repeated_by"
-"""Key of a transforms.json that names a COLMAP model beside it with the same cameras, as `visdom-export` does."""
 
 
 @dataclass(frozen=True)
@@ -75,15 +70,6 @@ class Transforms:
 def recognise(root: Path) -> str | None:
     """transforms.json, or None."""
     return "transforms.json" if (root / "transforms.json").exists() else None
-
-
-def is_repeated(root: Path) -> bool:
-    """Whether transforms.json says that the COLMAP model beside it holds the same cameras."""
-    try:
-        content = json.loads((root / "transforms.json").read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(content, dict) and isinstance(content.get(REPEATED_BY), str)
 
 
 def recognise_blender(root: Path) -> str | None:

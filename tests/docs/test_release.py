@@ -1,4 +1,4 @@
-"""The version is the same wherever it stands, and the changelog has a dated section for it."""
+"""Files about the project agree: the version, with a dated section of the changelog, the Pythons, the paper."""
 
 import importlib.util
 import json
@@ -14,6 +14,8 @@ from visdom_plugin.cli.commands import check
 from visdom_plugin.training.run import find_versions
 
 ROOT = Path(__file__).parents[2]
+PROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+CITATION = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
 CHANGES = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
@@ -25,20 +27,18 @@ def installed():
 
 
 def test_the_version_stands_alike_in_all_places(installed, capsys):
-    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     sections = re.findall(r"^## \[([\d.]+)\](?: - (\d{4}-\d\d-\d\d))?$", CHANGES, re.M)
     assert check.main(["--version"]) == 0
     found = {
-        re.search(r'^version = "([^"]+)"$', project, re.M).group(1),
+        re.search(r'^version = "([^"]+)"$', PROJECT, re.M).group(1),
         visdom_plugin.__version__,
-        str(citation["version"]),
+        str(CITATION["version"]),
         find_versions()["visdom-plugin"],
         capsys.readouterr().out.split()[-1],
         sections[0][0],
     }
     assert found == {visdom_plugin.__version__}
-    assert sections[0][1] == str(citation["date-released"])
+    assert sections[0][1] == str(CITATION["date-released"])
 
 
 def test_sections_of_the_changelog_are_in_order_and_none_is_empty_but_the_coming_one():
@@ -74,3 +74,30 @@ def test_the_readme_of_a_package_index_links_to_nothing_that_is_not_there():
     assert re.search(r"!\[[^\]]+\]\(https://forge\.org/us/it/raw/v1\.2\.3/docs/pictures/[\w.]+\)", linked)
     paths = re.findall(r"\(https://forge\.org/us/it/(?:raw|blob)/v1\.2\.3/([^)#\s]+)", linked)
     assert len(paths) > 10 and all((ROOT / path).exists() for path in paths)
+
+
+def minors(lowest: str, highest: str) -> list[str]:
+    return [f"3.{minor}" for minor in range(int(lowest), int(highest) + 1)]
+
+
+def supported() -> list[str]:
+    lowest, above = re.search(r'^requires-python = ">=3\.(\d+),<3\.(\d+)"$', PROJECT, re.M).groups()
+    return minors(lowest, str(int(above) - 1))
+
+
+def test_readme_classifiers_and_workflow_name_the_pythons_of_requires_python():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert minors(*re.search(r"^Python 3\.(\d+) to 3\.(\d+)\.", readme, re.M).groups()) == supported()
+    assert re.findall(r'"Programming Language :: Python :: (3\.\d+)"', PROJECT) == supported()
+    jobs = yaml.safe_load((ROOT / ".github/workflows/checks.yml").read_text(encoding="utf-8"))["jobs"]
+    assert jobs["tests"]["strategy"]["matrix"]["python"] == supported()
+    assert jobs["wheel"]["strategy"]["matrix"]["python"] == [supported()[0], supported()[-1]]
+
+
+def test_the_citation_is_of_this_release_and_this_paper():
+    def field(name: str) -> str:
+        return re.search(rf'^{name} = "([^"]+)"$', PROJECT, re.M).group(1)
+
+    assert (CITATION["title"], CITATION["version"]) == (field("name"), field("version"))
+    assert CITATION["license"] == field("license")
+    assert CITATION["preferred-citation"]["url"] == field("Paper")

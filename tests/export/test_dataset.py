@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from datamodules import load
-from datamodules.layouts.transforms import REPEATED_BY
+from datamodules.recognise import REPEATED_BY
 from visdom_plugin.errors import SceneError
 from visdom_plugin.export.dataset import write_dataset
 from visdom_plugin.export.upright import upright

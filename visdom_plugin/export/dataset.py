@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datamodules.layouts.transforms import REPEATED_BY
+from datamodules.recognise import REPEATED_BY
 from visdom_plugin.atomic_files import write_bytes, write_json
 from visdom_plugin.export.meshes import Mesh, move
 from visdom_plugin.figures.contact_sheet import picture_names, write_png
