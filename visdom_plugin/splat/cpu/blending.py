@@ -75,7 +75,7 @@ def blend(
             store(s, p + END, fill(real(np.inf)))
             for plane in range(RED, BEHIND, TILE):
                 store(s, p + plane, nothing)
-        start, finish = starts[tile], starts[tile + 1]
+        start, finish = np.int64(starts[tile]), np.int64(starts[tile + 1])
         k = start
         while k < finish:
             first_row, end_row = TILE, 0
@@ -140,7 +140,8 @@ def blend_backward(
     s, batch = scratch(alpha, TILE * PLANES), scratch(alpha, BATCH * RECORD)
     nothing = fill(zero)
     for tile in range(begin, end):
-        start, finish = starts[tile], starts[tile] + reached[tile]
+        start = np.int64(starts[tile])
+        finish = start + reached[tile]
         for k in range(finish, starts[tile + 1]):
             store(sums, np.int64(slots[k]) * SUMS, nothing)
         if start == finish:

@@ -54,24 +54,25 @@ LARGEST = 80.0
 
 assert RECORD == WIDTH
 
-# A kernel's scratch array: vectors of the axes in camera coordinates and their gradients, by rows; records and
-# their gradients, by fields; basis functions, and their part in the loss; harmonics, by numbers of a Gaussian.
-AXES, G_AXES, FIELDS, G_FIELDS, BASIS, WEIGHTS, SH = (WIDTH * plane for plane in (0, 9, 18, 34, 50, 66, 82))
+# A kernel's scratch array: vectors of the records and their gradients, by fields; axes in camera coordinates and
+# their gradients, by rows; basis functions, and their part in the loss; harmonics, by numbers of a Gaussian.
+FIELDS, G_FIELDS, AXES, G_AXES, BASIS, WEIGHTS, SH = (WIDTH * plane for plane in (0, 16, 32, 41, 50, 66, 82))
 PLANES = 130
 
 
 @kernel(fast=True)
-def _turned(camera, row, x, y, z):
-    """A row of the camera's rotation times a vector."""
-    return camera[row] * x + camera[row + 1] * y + camera[row + 2] * z
+def _turned(a, b, c, x, y, z):
+    """A row (a, b, c) of the camera's rotation times a vector."""
+    return a * x + b * y + c * z
 
 
 @kernel(fast=True)
 def _camera_point(i, means, camera):
     """World coordinates of 16 means and camera coordinates."""
     mx, my, mz = take(means, 3 * i, 3), take(means, 3 * i + 1, 3), take(means, 3 * i + 2, 3)
-    x, y = _turned(camera, 0, mx, my, mz) + camera[9], _turned(camera, 3, mx, my, mz) + camera[10]
-    return mx, my, mz, x, y, _turned(camera, 6, mx, my, mz) + camera[11]
+    x = _turned(camera[0], camera[1], camera[2], mx, my, mz) + camera[9]
+    y = _turned(camera[3], camera[4], camera[5], mx, my, mz) + camera[10]
+    return mx, my, mz, x, y, _turned(camera[6], camera[7], camera[8], mx, my, mz) + camera[11]
 
 
 @kernel(fast=True)
@@ -83,18 +84,16 @@ def _unit_quaternion(i, quaternions):
 
 
 @kernel(fast=True)
-def _put_axis(s, k, camera, x, y, z):
-    for row in range(3):
-        store(s, AXES + WIDTH * (3 * row + k), _turned(camera, 3 * row, x, y, z))
-
-
-@kernel(fast=True)
 def _put_axes(i, quaternions, camera, s):
     """Writes the Gaussians' axes in camera coordinates."""
     w, x, y, z, _ = _unit_quaternion(i, quaternions)
-    _put_axis(s, 0, camera, 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-    _put_axis(s, 1, camera, 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
-    _put_axis(s, 2, camera, 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    x0, y0, z0 = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
+    x1, y1, z1 = 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
+    x2, y2, z2 = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+    for row in range(3):
+        a, b, c = camera[3 * row], camera[3 * row + 1], camera[3 * row + 2]
+        axes = _turned(a, b, c, x0, y0, z0), _turned(a, b, c, x1, y1, z1), _turned(a, b, c, x2, y2, z2)
+        store_all(s, AXES + WIDTH * 3 * row, axes)
 
 
 @kernel(fast=True)
