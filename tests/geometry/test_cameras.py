@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from visdom_plugin.errors import SceneError
-from visdom_plugin.geometry.camera_paths import interpolate, look_at_camera, orbit
+from visdom_plugin.geometry.camera_paths import capture_up, interpolate, look_at_camera, orbit
 from visdom_plugin.geometry.cameras import Cameras, look_at_point, project, rays_of
 from visdom_plugin.geometry.rotations import matrix_from_quaternion
 
@@ -110,6 +110,62 @@ def test_orbit_looks_at_the_object_from_one_distance():
     _, depth = project(circle, target[None])
     assert torch.allclose(depth, torch.full_like(depth, 3.0), atol=1e-3)
     assert len(circle) == 12
+
+
+def handheld(roll_degrees: float, seed: int) -> Cameras:
+    """Four cameras on one side of an object, looking down at it, each rolled by about so much."""
+    g = torch.Generator().manual_seed(seed)
+    azimuth, elevation = (
+        1.2 * torch.rand(4, generator=g).double(),
+        0.4 + 0.6 * torch.rand(4, generator=g).double(),
+    )
+    flat = torch.stack([azimuth.cos(), azimuth.sin()], -1) * elevation.cos()[:, None]
+    centres = 3 * torch.cat([flat, elevation.sin()[:, None]], -1)
+    motion = look_at_camera(centres, torch.zeros(3).double(), torch.tensor([0, 0, 1.0]).double())
+    roll = math.radians(roll_degrees) * torch.randn(4, generator=g).double()
+    turn = torch.eye(4).double().repeat(4, 1, 1)
+    turn[:, 0, 0] = turn[:, 1, 1] = roll.cos()
+    turn[:, 1, 0], turn[:, 0, 1] = roll.sin(), -roll.sin()
+    K = torch.tensor([[110.0, 0, 50], [0, 110.0, 40], [0, 0, 1]], dtype=torch.float64)
+    return Cameras.from_matrices(K, motion @ turn, width=100, height=80)
+
+
+def tilt_degrees(up, true=(0.0, 0.0, 1.0)) -> float:
+    return math.degrees(math.acos(min(1.0, float(up @ torch.as_tensor(true, dtype=up.dtype)))))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_up_is_where_level_cameras_say_whatever_side_they_stand_on(seed):
+    cameras = handheld(0.0, seed)
+    mean = -cameras.world_from_camera[:, :3, 1].mean(0)
+    assert tilt_degrees(mean / mean.norm()) > 20
+    assert tilt_degrees(capture_up(cameras)) < 0.2 * tilt_degrees(mean / mean.norm())
+    # Up turns with the world.
+    turn = matrix_from_quaternion(torch.tensor([0.3, -0.5, 0.7, 0.2]).double())
+    poses = cameras.world_from_camera.clone()
+    poses[:, :3] = turn @ poses[:, :3]
+    turned = Cameras(cameras.intrinsics, poses, cameras.width, cameras.height)
+    assert torch.allclose(capture_up(turned), turn @ capture_up(cameras), atol=1e-12)
+
+
+def test_cameras_that_are_held_by_hand_give_a_better_up_than_their_mean():
+    tilts, means = [], []
+    for seed in range(40):
+        cameras = handheld(4.0, seed)
+        mean = -cameras.world_from_camera[:, :3, 1].mean(0)
+        tilts.append(tilt_degrees(capture_up(cameras)))
+        means.append(tilt_degrees(mean / mean.norm()))
+    assert np.median(tilts) < 0.4 * np.median(means)
+
+
+def test_up_of_cameras_whose_ups_cancel_is_z():
+    down = look_at_camera(
+        torch.tensor([[0.0, 0, 3], [0, 0, 3]]), torch.zeros(3), torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
+    )
+    cameras = Cameras.from_matrices(
+        torch.tensor([[110.0, 0, 50], [0, 110, 40], [0, 0, 1]]), down, width=100, height=80
+    )
+    assert capture_up(cameras).tolist() == [0, 0, 1]
 
 
 def skewed(K, row: int, column: int):
