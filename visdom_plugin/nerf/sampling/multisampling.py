@@ -85,51 +85,47 @@ def _multisample_cpu(origins, directions, distances, radius, random, std_scale):
     first, second = axes_across(directions.detach())
     frame = torch.stack([first, second, directions.detach(), origins.detach()], -2).expand(*lead, 4, 3)
     count = radius.numel()
-    random = distances.new_empty(count, 0) if random is None else random.expand(*lead, sections)
-    frame, distances, radius, random = (
+    frame, distances, radius = (
         x.detach().float().reshape(count, *shape).contiguous().numpy()
-        for x, shape in ((frame, (4, 3)), (distances, (-1,)), (radius, ()), (random, random.shape[-1:]))
+        for x, shape in ((frame, (4, 3)), (distances, (-1,)), (radius, ()))
     )
     points = np.empty((len(radius), sections, 6, 3), np.float32)
     std = np.empty((len(radius), sections, 6), np.float32)
     unit = np.float32([[math.cos(a), math.sin(a)] for a in ANGLES])
-    arguments = (
-        frame,
-        distances,
-        radius,
-        random,
-        unit,
-        np.float32(STEPS),
-        np.float32(std_scale),
-        points,
-        std,
-    )
-    parallel_for(_hexagons, len(radius), RAYS_PER_PIECE, *arguments)
+    rays, shape = (frame, distances, radius), (unit, np.float32(STEPS), np.float32(std_scale))
+    if random is None:
+        flat = points.reshape(len(radius), sections, 18)
+        parallel_for(_fixed_hexagons, len(radius), RAYS_PER_PIECE, *rays, *shape, flat, std)
+    else:
+        turns = random.detach().float().expand(*lead, sections).reshape(count, sections).contiguous().numpy()
+        parallel_for(_hexagons, len(radius), RAYS_PER_PIECE, *rays, turns, *shape, points, std)
     return torch.from_numpy(points).reshape(*lead, sections, 6, 3), torch.from_numpy(std).reshape(
         *lead, sections, 6
     )
 
 
-@kernel(error_model="numpy")
+@kernel(error_model="numpy", inline="always")
+def _place(t0, t1):
+    """Where a section's points lie along its ray: at base + scale * step."""
+    real = np.float32
+    middle, half = real(0.5) * (t0 + t1), real(0.5) * (t1 - t0)
+    k = half / max(middle, real(1e-20))
+    squared = (k * k - real(1)) * (k * k - real(1))
+    scale = half / (k * k + real(3))
+    base = t0 + scale * ((real(1) + k) * (real(1) + k) + real(2))
+    return base, scale * math.sqrt(squared + real(4))
+
+
+@kernel(error_model="numpy", counted=False)
 def _hexagons(begin, end, frame, distances, radius, random, unit, steps, std_scale, points, std):
     real = np.float32
     for ray in range(begin, end):
         f = frame[ray]
         wide = radius[ray] * real(math.sqrt(0.5))
         for section in range(distances.shape[1] - 1):
-            t0, t1 = distances[ray, section], distances[ray, section + 1]
-            middle, half = real(0.5) * (t0 + t1), real(0.5) * (t1 - t0)
-            k = half / max(middle, real(1e-20))
-            squared = (k * k - real(1)) * (k * k - real(1))
-            scale = half / (k * k + real(3))
-            base = t0 + scale * ((real(1) + k) * (real(1) + k) + real(2))
-            scale *= math.sqrt(squared + real(4))
-            if random.shape[1]:
-                mirrored = random[ray, section] < real(0.5)
-                turn = real(4 * math.pi) * random[ray, section]
-            else:
-                mirrored = section % 2 == 1
-                turn = real(math.pi / 6) if mirrored else real(0)
+            base, scale = _place(distances[ray, section], distances[ray, section + 1])
+            mirrored = random[ray, section] < real(0.5)
+            turn = real(4 * math.pi) * random[ray, section]
             cos, sin = math.cos(turn), math.sin(turn)
             point, deviation = points[ray, section], std[ray, section]
             for j in range(6):
@@ -140,3 +136,31 @@ def _hexagons(begin, end, frame, distances, radius, random, unit, steps, std_sca
                 deviation[j] = std_scale * across
                 for axis in range(3):
                     point[j, axis] = x * f[0, axis] + y * f[1, axis] + t * f[2, axis] + f[3, axis]
+
+
+@kernel(error_model="numpy")
+def _fixed_hexagons(begin, end, frame, distances, radius, unit, steps, std_scale, points, std):
+    """Without random turns: the points of a ray lie on twelve lines, of which every section takes six."""
+    real = np.float32
+    turn = real(math.pi / 6)
+    cos, sin = math.cos(turn), math.sin(turn)
+    lines, origin, along = np.empty((2, 18), np.float32), np.empty(18, np.float32), np.empty(18, np.float32)
+    for k in range(18):
+        along[k] = steps[k // 3]
+    for ray in range(begin, end):
+        f = frame[ray]
+        wide = radius[ray] * real(math.sqrt(0.5))
+        for k in range(18):
+            j, axis = k // 3, k % 3
+            c, s = unit[j, 0], unit[j, 1]
+            origin[k] = f[3, axis]
+            lines[0, k] = wide * (c * f[0, axis] + s * f[1, axis]) + f[2, axis]
+            c, s = c * cos + s * sin, c * sin - s * cos
+            lines[1, k] = wide * (c * f[0, axis] + s * f[1, axis]) + f[2, axis]
+        for section in range(distances.shape[1] - 1):
+            base, scale = _place(distances[ray, section], distances[ray, section + 1])
+            line = section % 2
+            for k in range(18):
+                points[ray, section, k] = origin[k] + (base + scale * along[k]) * lines[line, k]
+            for j in range(6):
+                std[ray, section, j] = std_scale * ((base + scale * steps[j]) * wide)
