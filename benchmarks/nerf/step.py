@@ -15,9 +15,10 @@ import statistics
 import time
 from dataclasses import replace
 
-from visdom_plugin.compute.process import wait_briefly
+from visdom_plugin.compute.process import keep_freed_memory, wait_briefly
 
-wait_briefly()  # before torch is imported, as the commands do
+wait_briefly()  # both before torch is imported, as the commands do
+keep_freed_memory()
 
 import torch
 

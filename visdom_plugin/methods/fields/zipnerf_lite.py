@@ -39,6 +39,7 @@ from visdom_plugin.nerf.sampling.contraction import contract
 from visdom_plugin.nerf.sampling.multisampling import multisample
 from visdom_plugin.nerf.sampling.ray_warp import curve_distances, distances_of
 from visdom_plugin.nerf.sampling.step_functions import anneal, sample_edges
+from visdom_plugin.render import Render
 from visdom_plugin.seeding import draw_on, generator, uniform
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
@@ -60,16 +61,19 @@ class AntialiasedGrid(nn.Module):
         # Features, and for each level how much of it the sample is too large for.
         self.net = perceptron([layout.width + layout.levels, hidden, outputs], generator)
 
-    def forward(self, points: Tensor, std: Tensor) -> Tensor:
-        """(..., S, 3) points in the local frame and (..., S) standard deviations to (..., outputs)."""
+    def forward(self, points: Tensor, std: Tensor, mean_squares: Tensor | None = None) -> Tensor:
+        """(..., S, 3) points in the local frame and (..., S) standard deviations to (..., outputs).
+
+        `mean_squares` saves looking through the table for them.
+        """
         unit, std = contract(points, std, scale=0.25, shift=0.5)
         features, weights = encode_mean(unit, std, self.table, self.layout)
-        magnitude = (INITIAL_FEATURE**2 + mean_square_per_level(self.table.detach(), self.layout)).sqrt()
-        return self.net(features, (2 * weights - 1) * magnitude)
+        squares = self.mean_squares() if mean_squares is None else mean_squares
+        return self.net(features, (2 * weights - 1) * (INITIAL_FEATURE**2 + squares.detach()).sqrt())
 
-    def decay(self) -> Tensor:
-        """Mean squares of the table, summed over the levels."""
-        return mean_square_per_level(self.table, self.layout).sum()
+    def mean_squares(self) -> Tensor:
+        """(levels,) of the table's features."""
+        return mean_square_per_level(self.table, self.layout)
 
 
 class ColourNet(nn.Module):
@@ -123,6 +127,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
                 ),
             }
         ).to(self.device)
+        self._squares: list[Tensor] | None = None
         named = dict(self.model.named_parameters())
         self.optimiser = FieldOptimiser([(named, 0.0)], betas=(0.9, 0.99), eps=1e-15)
 
@@ -134,7 +139,8 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         draw = draw_on(self.device, generator(self.seed, "step", step))
         background = self.draw_background(len(batch.mask), draw)
         rays = self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
-        levels, out = self._see(rays, batch.radii, c.samples, step, draw)
+        squares = self._mean_squares()
+        levels, out = self._see(rays, batch.radii, c.samples, step, draw, squares)
         colours = self._shade(out, rays.directions[:, None])
         last = levels[-1]
         rgb, alpha, _ = composite(last.weights, colours, last.t, background)
@@ -158,15 +164,14 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
             loss = distortion_loss(curve_distances(last.t), last.weights).mean()
             losses["distortion"] = c.distortion_weight * loss
         if c.hash_decay:
-            grids = (self._grid(name).decay() for name in LEVELS)
-            losses["hash_decay"] = c.hash_decay * reduce(torch.add, grids)
+            losses["hash_decay"] = c.hash_decay * reduce(torch.add, (x.sum() for x in squares))
         losses |= self.prior_losses(step) | self.empty_losses(len(batch.mask), step)
         return StepOutput(losses, {"psnr": psnr_of(error)})
 
     def silhouette_of_nothing(
         self, rays: LocalRays, radius: Tensor, step: int, generator: Generator
     ) -> Tensor:
-        levels, _ = self._see(rays, radius, self.config.samples, step, generator)
+        levels, _ = self._see(rays, radius, self.config.samples, step, generator, self._mean_squares())
         return self._silhouette_loss(levels, levels[-1].weights.sum(-1), torch.zeros_like(radius))
 
     def _silhouette_loss(
@@ -203,14 +208,24 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         near = torch.full(origins.shape[:-1], self.config.near, device=origins.device)
         return near, torch.full_like(near, self.config.far)
 
+    def _mean_squares(self) -> list[Tensor]:
+        """Of the table of each level (levels of the table,)."""
+        return [self._grid(name).mean_squares() for name in LEVELS]
+
     def _see(
-        self, rays: LocalRays, radius: Tensor, counts: Sequence[int], step: int, generator: Generator
+        self,
+        rays: LocalRays,
+        radius: Tensor,
+        counts: Sequence[int],
+        step: int,
+        generator: Generator,
+        squares: Sequence[Tensor],
     ) -> tuple[list[Level], Tensor]:
         """All levels along rays in a training step, and the field's outputs (n, S, ...), as `_look` has them."""
         level, progress = None, step / max(self.config.steps, 1)
         levels = []
-        for name, count in zip(LEVELS, counts, strict=True):
-            level, out = self._look(name, rays, radius, level, count, progress, generator)
+        for name, count, of_table in zip(LEVELS, counts, squares, strict=True):
+            level, out = self._look(name, rays, radius, level, count, progress, generator, of_table)
             levels.append(level)
         return levels, out
 
@@ -223,6 +238,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         count: int,
         progress: float,
         generator: Generator | None,
+        squares: Tensor,
     ) -> tuple[Level, Tensor]:
         """One level, sampled where the level before saw something, and its network's outputs (n, S, ...)."""
         n = len(rays.near)
@@ -236,8 +252,17 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         t = distances_of(s, near, far, self.config.spacing_power)
         turn = None if generator is None else uniform(generator, self.device, n, count)
         points, std = multisample(rays.origins, rays.directions, t, radius, turn)
-        density, out = density_of(self.model[name](points, std), self.config.density_bias)
+        density, out = density_of(self.model[name](points, std, squares), self.config.density_bias)
         return Level(s, t, weights_from_density(density, t)[0]), out
+
+    @torch.no_grad()
+    def render(self, camera: Cameras, background: Tensor) -> Render:
+        # The tables stay as they are for a whole view.
+        self._squares = self._mean_squares()
+        try:
+            return super().render(camera, background)
+        finally:
+            self._squares = None
 
     def render_rays(
         self, origins: Tensor, directions: Tensor, radius: Tensor, background: Tensor
@@ -249,10 +274,10 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         rgb, alpha, depth = background.expand(n, 3).clone(), torch.zeros_like(rays.near), rays.far.clone()
         left, level = rays.hit.nonzero()[:, 0], None
         rays = LocalRays(*(x[left] for x in rays))
-        for name, count in zip(LEVELS, counts, strict=True):
+        for name, count, squares in zip(LEVELS, counts, self._squares or self._mean_squares(), strict=True):
             if not len(left):
                 return rgb, alpha, depth
-            level, out = self._look(name, rays, radius, level, count, 1.0, None)
+            level, out = self._look(name, rays, radius, level, count, 1.0, None, squares)
             # Proposals bound the field's weights from above: where they see nothing, it does not either.
             seen = (level.weights.sum(-1) > INVISIBLE).nonzero()[:, 0]
             left, out, level = left[seen], out[seen], Level(*(x[seen] for x in level))
