@@ -115,10 +115,8 @@ def test_orbit_looks_at_the_object_from_one_distance():
 def handheld(roll_degrees: float, seed: int) -> Cameras:
     """Four cameras on one side of an object, looking down at it, each rolled by about so much."""
     g = torch.Generator().manual_seed(seed)
-    azimuth, elevation = (
-        1.2 * torch.rand(4, generator=g).double(),
-        0.4 + 0.6 * torch.rand(4, generator=g).double(),
-    )
+    azimuth = torch.linspace(0, 1.2, 4).double() + 0.2 * torch.rand(4, generator=g).double()
+    elevation = 0.4 + 0.6 * torch.rand(4, generator=g).double()
     flat = torch.stack([azimuth.cos(), azimuth.sin()], -1) * elevation.cos()[:, None]
     centres = 3 * torch.cat([flat, elevation.sin()[:, None]], -1)
     motion = look_at_camera(centres, torch.zeros(3).double(), torch.tensor([0, 0, 1.0]).double())
