@@ -27,7 +27,7 @@ from datamodules.request import Request
 from datamodules.views import splits
 from datamodules.views.find_files import ImageFiles
 from datamodules.views.lazy import LaterViews
-from datamodules.views.mask_files import assign_masks, find_ignored, looks_inverted
+from datamodules.views.mask_files import assign_masks, below_root, find_ignored, looks_inverted
 from datamodules.views.named_splits import choose_named
 from datamodules.views.reader import ViewReader, map_on_cores
 from visdom_plugin.errors import SceneError, list_some
@@ -80,7 +80,7 @@ def choose_files(capture: Capture, request: Request) -> Chosen:
         split = choose_named(capture.root, names, request)
     wanted = [*split.train, *split.test]
     _refuse_absent(there, [asked[i] for i in wanted if found[i] is None])
-    masks = assign_masks(capture, wanted, request)
+    masks = assign_masks(capture, wanted, _name_masks(capture, request))
     ignored = find_ignored(capture, wanted, request)
     files = [
         _files(capture.frames[i], found[i] or asked[i], masks.of[i], ignored.get(i), there) for i in wanted
@@ -109,6 +109,13 @@ def find_free_views(capture: Capture, request: Request) -> FreeViews | None:
     return FreeViews(tuple(capture.frames[i].name for i in free), capture.calibrate(free).cameras)
 
 
+def _name_masks(capture: Capture, request: Request) -> Request:
+    """The request with its folder of masks as it is called below the scene's."""
+    if request.masks is None:
+        return request
+    return replace(request, masks=below_root(request.masks, capture.root))
+
+
 def open_capture(capture: Capture, request: Request) -> Scene:
     """The scene of a request.
 
@@ -122,6 +129,7 @@ def open_capture(capture: Capture, request: Request) -> Scene:
         ConfigError: for a list given by hand that does not fit the data.
     """
     split, folder, factor, files, found = choose_files(capture, request)
+    request = _name_masks(capture, request)
     names = [frame.name for frame in capture.frames]
     calibration = capture.calibrate([*split.train, *split.test])
     reader = ViewReader(files, calibration, factor, request.downscale / capture.shrunk, capture, request)

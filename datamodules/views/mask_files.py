@@ -18,7 +18,7 @@ from datamodules.files.images import ENDINGS, is_image_name
 from datamodules.files.paths import inside, printable, stem
 from datamodules.request import Request
 from datamodules.views.find_files import loose_key
-from visdom_plugin.errors import ConfigError, SceneError, list_some
+from visdom_plugin.errors import ConfigError, SceneError, did_you_mean, list_some
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +36,30 @@ class MaskFiles(NamedTuple):
     of: dict[int, str | None]
     """By the frame's position; None where the alpha channel must do."""
     notes: tuple[str, ...] = ()
+
+
+def below_root(masks: str, root: Path) -> str:
+    """A folder of masks as it is called below the scene's folder.
+
+    Args:
+        masks: as a user names it: below the scene's folder, from the working directory, or absolute.
+
+    Raises:
+        ConfigError: it names two folders.
+    """
+    typed, own = Path(masks).expanduser(), root / masks
+    if typed.is_absolute():
+        return os.path.relpath(typed, root)
+    if not typed.is_dir():
+        return masks
+    if own.is_dir() and not own.samefile(typed):
+        raise ConfigError(
+            f"two folders are called {printable(masks)}: one below the scene's folder, one from where you are",
+            where=f"--masks {masks}",
+            todo=f"name one by its whole path: {own.resolve()} or {typed.resolve()}",
+            topic="mask-ambiguous",
+        )
+    return masks if own.is_dir() else os.path.relpath(typed.resolve(), root.resolve())
 
 
 def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> MaskFiles:
@@ -137,16 +161,15 @@ def _find_folder(
     folder = request.masks or capture.mask_folder
     if folder is None:
         return None, []
-    if request.masks and Path(folder).is_absolute():
-        folder = os.path.relpath(folder, capture.root)
     own = inside(capture.root, folder, outside=request.allow_outside)
     if request.masks:
         if own.is_dir():
             return folder, []
+        there = sorted(path.name for path in capture.root.iterdir() if path.is_dir())
         raise SceneError(
-            f"there is no folder {printable(folder)} for the masks",
+            f"there is no folder {printable(folder)} for the masks{did_you_mean(folder, there)}",
             where=capture.root,
-            todo="name one below the scene's folder with --masks",
+            todo="name one with --masks, below the scene's folder, or by its path from where you are",
             topic="mask-missing",
         )
     others = []

@@ -108,6 +108,10 @@ def choose(
     if held is None:
         taken = set(train or ())
         held = [i for i in pools.test if i not in taken] if request.hold_out else []
+        unused = count - len(taken) - len(held)
+        if train is not None and unused and request.train_list is not None and request.hold_out:
+            said = "%s: %d views neither train nor test (%s); --test-list names others to test on"
+            log.info(said, root, unused, pools.rule)
         rules.append(pools.rule if request.hold_out else "no view is held out")
     if train is None:
         # Test views stay out of training even when nobody asks for them: --views N means the same everywhere.

@@ -12,6 +12,7 @@ from tests import browser
 from visdom_plugin.cli.commands import report, train
 from visdom_plugin.cli.output.reports import repeat_command
 from visdom_plugin.figures.contact_sheet import colour_depth
+from visdom_plugin.report.page import write_page
 
 
 def finish(*options: str) -> Path:
@@ -79,6 +80,13 @@ def test_two_runs_stand_side_by_side(fakes):
     record = [json.loads((r / "run.json").read_text())["metrics"]["test"]["psnr"] for r in (first, second)]
     marked = re.findall(r'class="best"><strong>([\d.]+)', text)
     assert f"{max(record):.2f}" in marked
+    # None is, where they cannot be compared.
+    other = json.loads((second / "run.json").read_text())
+    other["data"]["hashes"] = {"train_views": "of others"}
+    (second / "run.json").write_text(json.dumps(other))
+    write_page(Path("apart.html"), [first, second])
+    text = Path("apart.html").read_text(encoding="utf-8")
+    assert "cannot be compared" in text and 'class="best"' not in text
 
 
 def test_bad_input_gets_one_clear_line(fakes, tmp_path, capsys):

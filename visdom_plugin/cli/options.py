@@ -265,7 +265,12 @@ def describe_reading(common: Common) -> dict[str, Any]:
     """How the scene was asked for, as run.json notes it, so that it can be loaded again."""
     folder = on_disk(common.data)
     path = common.data if folder is None else folder.expanduser().resolve()
-    return {"path": None if path is None else str(path), **read_options(common)}
+    reading = read_options(common)
+    if folder is not None and common.masks is not None and not (folder / common.masks).is_dir():
+        reading["masks"] = str(
+            Path(common.masks).expanduser().resolve()
+        )  # from another working directory, too
+    return {"path": None if path is None else str(path), **reading}
 
 
 def dump(request: Request) -> str:

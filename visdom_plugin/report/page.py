@@ -86,7 +86,7 @@ def to_html(runs: Sequence[Reported], folder: Path) -> str:
         places=_places(runs),
         curves=Markup(draw_curves(series)) if series else "",
         several=len(runs) > 1,
-        same_data=len({json.dumps(r.record["data"].get("hashes"), sort_keys=True) for r in runs}) == 1,
+        same_data=_same_data(runs),
     )
 
 
@@ -146,9 +146,14 @@ def _run(n: int, run: Reported, folder: Path) -> dict[str, Any]:
     }
 
 
+def _same_data(runs: Sequence[Reported]) -> bool:
+    """Whether their numbers can be compared."""
+    return len({json.dumps(run.record["data"].get("hashes"), sort_keys=True) for run in runs}) == 1
+
+
 def _metrics(runs: Sequence[Reported]) -> list[dict[str, Any]]:
     """Rows of the table of means: a cell per run with mean, worst view and whether it is the best of several."""
-    rows = []
+    rows, comparable = [], _same_data(runs)
     for key, title, unit, digits, more in METRICS:
         means = [run.record.get("metrics", {}).get("test", {}).get(key) for run in runs]
         if all(m is None for m in means):
@@ -162,7 +167,7 @@ def _metrics(runs: Sequence[Reported]) -> list[dict[str, Any]]:
                 {
                     "mean": "" if mean is None else f"{mean:.{digits}f}",
                     "worst": "" if worst is None else f"{worst:.{digits}f}",
-                    "best": len(runs) > 1 and mean == best,
+                    "best": len(runs) > 1 and mean == best and comparable,
                 }
             )
         per_view = [

@@ -32,6 +32,16 @@ def test_standard_with_too_few_views_is_said(views, warned, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
+    ("size", "asked", "said"), [((50, 99), 4, True), ((50, 99), 1, False), ((40, 100), 2, None)]
+)
+def test_photographs_made_too_small_are_told_of(size, asked, said):
+    note = train._describe_size(fake.tiny_scene().train.cameras.resized(*size), asked)
+    assert (note is None) == (said is None)
+    if note is not None:
+        assert "50 x 99 pixels, of which little" in note and ("leave out --downscale" in note) == said
+
+
+@pytest.mark.parametrize(
     ("size", "asked", "factor"), [((300, 799), 1, None), ((1600, 1200), 1, 4), ((600, 801), 2, 4)]
 )
 def test_photographs_too_large_for_a_quick_schedule_are_told_of(size, asked, factor):

@@ -13,6 +13,9 @@ import pytest
 import torch
 
 from datamodules import load
+from datamodules.synthetic.config import SyntheticConfig
+from datamodules.synthetic.scene import make_scene
+from tests.datamodules.layouts.layout_writers import write_colmap
 from tests.datamodules.layouts.prepared_writer import write_prepared
 from tests.hull.checks.faults import FAULTS, capture_of
 from visdom_plugin.cli import options
@@ -143,6 +146,17 @@ def test_a_sound_scene_ends_with_the_command_that_trains_on_it(folder, capsys):
     two = ",".join(load(folder, test=False).train.names[::2])
     assert main([str(folder), "--train-list", two]) == 0
     assert capsys.readouterr().err.splitlines()[-1].endswith(f"--train-list {two} --k 2")
+
+
+def test_where_all_views_were_checked_the_command_leaves_some_to_test_on(tmp_path, capsys):
+    views = make_scene(SyntheticConfig(size=(64, 48), train_views=9, test_views=0)).train
+    scene = write_colmap(views, tmp_path / "s")
+    for count, wanted in (("9", "6"), ("8", "6"), ("5", "5")):
+        main([str(scene), "--views", count])
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert last.startswith("next") and f"--views {wanted}" in last
+        common = options.parse(shlex.split(last)[2:]).common
+        assert len(load(scene, views=common.views).test)
 
 
 @pytest.mark.parametrize(("longest", "factor"), [(200, 2), (799, 2), (800, 4), (1500, 4), (4032, 16)])

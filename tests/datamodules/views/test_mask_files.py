@@ -13,7 +13,7 @@ from datamodules import load
 from datamodules.synthetic.config import SyntheticConfig
 from datamodules.synthetic.scene import make_scene
 from tests.datamodules.layouts import layout_writers as w
-from visdom_plugin.errors import SceneError
+from visdom_plugin.errors import ConfigError, SceneError
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +113,37 @@ def test_missing_masks_beside_stray_ones_are_not_called_shifted(views, tmp_path,
         (folder / "masks/train_999.png").write_bytes((folder / "masks/train_001.png").read_bytes())
         assert len(load(folder, train_list="1,2", test=False).train) == 2
     assert "shifted" not in caplog.text
+
+
+def test_a_folder_of_masks_may_be_named_from_where_one_is(views, tmp_path, monkeypatch):
+    folder = w.write_colmap(views, tmp_path / "s")
+    (folder / "masks").rename(folder / "cut_outs")
+    wanted = load(folder, views=7, masks="cut_outs").train
+    monkeypatch.chdir(tmp_path)
+    for named in ("s/cut_outs", "./s/cut_outs", str(folder / "cut_outs")):
+        found = load(folder, views=7, masks=named).train
+        assert all(torch.equal(a, b) for a, b in zip(found.masks, wanted.masks, strict=True))
+    with pytest.raises(SceneError, match="no folder cut_out for the masks; did you mean 'cut_outs'"):
+        load(folder, views=7, masks="cut_out")
+    (tmp_path / "cut_outs").mkdir()
+    with pytest.raises(ConfigError, match="two folders are called cut_outs"):
+        load(folder, views=7, masks="cut_outs")
+    (folder / "cut_outs").rename(tmp_path / "beside")
+    assert len(load(folder, views=7, masks="beside", allow_outside=True).train.masks) == 7
+
+
+def test_views_that_neither_train_nor_test_are_told_of(views, tmp_path, caplog):
+    folder = w.write_colmap(views, tmp_path / "s")
+    names = ",".join(views.names[:4])
+    with caplog.at_level(logging.INFO, "datamodules"):
+        scene = load(folder, train_list=names)
+    unused = len(views) - 4 - len(scene.test)
+    assert unused and f"{unused} views neither train nor test" in caplog.text and "--test-list" in caplog.text
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "datamodules"):
+        load(folder, train_list=names, test_list=views.names[5] + ",")
+        load(folder, views=4)
+    assert "neither train nor" not in caplog.text
 
 
 def test_the_folder_that_may_hold_the_masks_is_named(views, tmp_path):

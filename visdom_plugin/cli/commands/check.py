@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 FOUND = 1
 """Exit status with findings."""
+NONE_LEFT, FEW_VIEWS = ("views train, there are no more", "no view is held out"), 6
+"""Words of the rules by which all views are taken, and how many to train with then: some are left to test on."""
 
 
 _WIDE = (0.8, 1.25)
@@ -111,7 +113,10 @@ def _main(argv: Sequence[str]) -> int:
 
         wanted = found.advice.k if found.advice is not None and k is None else k
         k = None if wanted == USUAL_K else wanted
-        say(f"next: {training_command(folder, read_options(options), longest, k=k)}")
+        reading = read_options(options)
+        if any(rule in str(scene.source.get("split")) for rule in NONE_LEFT):
+            reading["views"] = min(reading["views"], FEW_VIEWS)
+        say(f"next: {training_command(folder, reading, longest, k=k)}")
     return FOUND if found.findings else 0
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from visdom_plugin.cli import entry, options
-from visdom_plugin.cli.output.reports import SWIFT_PX, swift_factor
+from visdom_plugin.cli.output.reports import SMALL_PX, SWIFT_PX, swift_factor
 from visdom_plugin.cli.output.terminal import load_torch, say, show_next, show_result
 from visdom_plugin.compute.ahead import prepare, training_job
 from visdom_plugin.viewer.serve import require_viser
@@ -82,14 +82,20 @@ def _train(argv: Sequence[str]) -> None:
 
 
 def _describe_size(cameras: Cameras, downscale: float) -> str | None:
-    """What to say of pictures that are too large for quick schedules; None of others."""
+    """What to say of pictures that are too large for quick schedules, or too small; None of others."""
     width, height = max((camera.size for camera in (cameras[i] for i in range(len(cameras)))), key=math.prod)
     factor = swift_factor(downscale, max(width, height))
+    if max(width, height) < SMALL_PX:
+        smaller = "; leave out --downscale" if downscale > 1 else ""
+        return (
+            f"the photographs have {width} x {height} pixels, of which little can be learnt{smaller}: "
+            f"budget quick is made for {SMALL_PX} to {SWIFT_PX}"
+        )
     if factor == downscale:
         return None
     return (
-        f"the photographs have {width} x {height} pixels, and budget quick is made for 100 to {SWIFT_PX}: it will "
-        f"take long. Quicker: --downscale {factor:g}"
+        f"the photographs have {width} x {height} pixels, and budget quick is made for {SMALL_PX} to {SWIFT_PX}: "
+        f"it will take long. Quicker: --downscale {factor:g}"
     )
 
 

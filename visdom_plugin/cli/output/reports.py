@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from visdom_plugin.compute.waiting import phase
 
-SWIFT_PX = 400
-"""Longest side of pictures on which the quick schedules take a minute or two."""
+SMALL_PX, SWIFT_PX = 100, 400
+"""Longest sides of pictures for which the quick schedules are made: up to the second they take a minute or two."""
 
 if TYPE_CHECKING:
     from visdom_plugin.hull.hull import Hull

@@ -104,7 +104,10 @@ def show_result(record: dict[str, Any], folder: Path) -> None:
     if measured:
         console.print(table)
     else:
-        why = "no test view has a mask of its own" if views else "the scene has no test views"
+        why = "no test view has a mask of its own"
+        if not views:
+            trained = len(record["data"]["train"])
+            why = f"no view is left to test on: {trained} train. Fewer --views, or --test-list, leave some"
         console.print(f"{title}: nothing is measured, because {why}", highlight=False, markup=False)
     timing = record.get("timing", {})
     if "train_s" in timing:
