@@ -11,7 +11,7 @@ import yaml
 
 import visdom_plugin
 from visdom_plugin.cli.commands import check
-from visdom_plugin.training.run import find_versions
+from visdom_plugin.training.runs.run_directory import find_versions
 
 ROOT = Path(__file__).parents[2]
 PROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")

@@ -169,6 +169,13 @@ def test_a_method_that_returns_bare_losses_is_told_what_to_return(train, monkeyp
     assert "FakeMethod" in str(refused.value.where)
 
 
+def test_a_method_whose_export_names_no_files_is_told_what_to_return(train, tmp_path, monkeypatch):
+    monkeypatch.setattr(FakeMethod, "export", lambda self, folder: None)
+    with pytest.raises(PluginError, match="returned a NoneType, not the list") as refused:
+        train()
+    assert "FakeMethod" in str(refused.value.where) and not list((tmp_path / "run").rglob(".part-*"))
+
+
 def test_scenes_without_test_views_still_train_and_show_pictures(train, scene, tmp_path):
     empty = Views(scene.test.cameras[:0], [], [], [])
     record = train(scene=replace(scene, test=empty))

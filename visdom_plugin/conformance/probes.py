@@ -65,7 +65,7 @@ class GaussianProbe:
         """Means of the Gaussians of each call of `after_step`, by step."""
         self.marked: dict[int, list[Tensor]] = {}
 
-    def initial_points(self, n: int, generator: Generator) -> tuple[Tensor, Tensor]:
+    def initial_points(self, n: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
         middle = torch.as_tensor(self.hull.centre).float()
         xyz = middle + 0.1 * (self.hull.sample_inside(n, generator).float() - middle)
         self.points.append(xyz)

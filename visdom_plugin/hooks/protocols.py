@@ -154,8 +154,11 @@ class GaussianHook(Protocol):
     Random numbers come from the generators handed in alone, so that the same question has the same answer.
     """
 
-    def initial_points(self, n: int, generator: Generator) -> tuple[Tensor, Tensor]:
-        """At most `n` starting points: xyz (M, 3) world frame and rgb (M, 3) in [0, 1]."""
+    def initial_points(self, n: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
+        """At most `n` starting points: xyz (M, 3) world frame and rgb (M, 3) in [0, 1].
+
+        The same ones each time without a `generator`.
+        """
         ...
 
     def loss(self, render: Callable[[Cameras], Render], step: int, generator: Generator) -> dict[str, Tensor]:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import logging
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Protocol
 
@@ -28,7 +26,7 @@ from visdom_plugin.training.progress import Progress
 from visdom_plugin.training.protocols import Batch, Hook, Method
 from visdom_plugin.training.runs import checkpoints
 from visdom_plugin.training.runs.config_io import as_plain, differences
-from visdom_plugin.training.runs.run_directory import Record, RunDir, describe_data
+from visdom_plugin.training.runs.run_directory import Record, RunDir, describe_data, find_versions
 from visdom_plugin.training.runs.saved_hulls import REFERENCE, find_hull, read_hull, write_hull
 from visdom_plugin.training.trainer import Trainer, summarise, view_psnr
 from visdom_plugin.training.training_views import draw_training_views, refuse_empty
@@ -384,20 +382,16 @@ def export(method: Method, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     with tempfile.TemporaryDirectory(prefix=".part-", dir=folder.parent) as draft:
-        for made in method.export(Path(draft)):
+        made_all = method.export(Path(draft))
+        if not isinstance(made_all, list):
+            raise PluginError(
+                f"export returned a {type(made_all).__name__}, not the list of the files that it wrote",
+                where=f"{type(method).__module__}.{type(method).__qualname__}",
+                todo="return [path, ...], each below the folder it was given",
+            )
+        for made in made_all:
             target = folder / Path(made).relative_to(draft)
             with appearing(target) as part:
                 Path(made).replace(part)
             written.append(target)
     return written
-
-
-def find_versions() -> dict[str, str | None]:
-    """Versions of what the numbers depend on."""
-    found: dict[str, str | None] = {"python": platform.python_version(), "platform": platform.platform()}
-    for name in ("visdom-plugin", "torch", "numpy", "numba", "gsplat"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = None
-    return found

@@ -34,7 +34,7 @@ class RemovesUntil:
     def __init__(self, hook: GaussianHook, until: int):
         self.hook, self.until = hook, until
 
-    def initial_points(self, n: int, generator: Generator) -> tuple[Tensor, Tensor]:
+    def initial_points(self, n: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
         return self.hook.initial_points(n, generator)
 
     def loss(self, render: Callable[[Cameras], Render], step: int, generator: Generator) -> State:

@@ -12,9 +12,8 @@ from visdom_plugin.errors import VisDomError
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import Scene
 from visdom_plugin.training.hull_run.config import METHOD, HullRunConfig
-from visdom_plugin.training.run import find_versions
 from visdom_plugin.training.runs.config_io import as_plain
-from visdom_plugin.training.runs.run_directory import Record, RunDir, describe_data
+from visdom_plugin.training.runs.run_directory import Record, RunDir, describe_data, find_versions
 from visdom_plugin.training.runs.saved_hulls import write_hull
 
 log = logging.getLogger(__name__)

@@ -13,8 +13,10 @@ import hashlib
 import json
 import logging
 import os
+import platform
 import shutil
 from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TextIO, TypeAlias
 
@@ -353,3 +355,14 @@ def read_record(path: Path) -> Record:
             todo="use the version of visdom-plugin that wrote it",
         )
     return record
+
+
+def find_versions() -> dict[str, str | None]:
+    """Versions of what the numbers depend on."""
+    found: dict[str, str | None] = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in ("visdom-plugin", "torch", "numpy", "numba", "gsplat"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
