@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.scene import Views, describe_masks
+from visdom_plugin.scene import Scene, Views, describe_masks
 
 
 def make_views(**fields):
@@ -61,3 +61,10 @@ def test_the_summary_tells_the_kinds_apart_and_reads_no_pixels_of_plain_views():
     text = "\n".join(describe_masks(mixed))
     assert "2 foreground" in text and "1 views whose mask is the outline" in text and "colour only" in text
     assert f"1 views with ignored pixels ({half.float().mean():.1%}" in text
+
+
+def test_a_scene_is_shown_in_one_line():
+    views = make_views()
+    scene = Scene("kettle", views, views.take([1]))
+    assert repr(views) == "Views(4 of 8 x 6 pixels: a, b, c, d)"
+    assert repr(scene) == f"Scene('kettle', train={views!r}, test=Views(1 of 8 x 6 pixels: b))"

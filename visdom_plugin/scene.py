@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from visdom_plugin.errors import SceneError
+from visdom_plugin.errors import SceneError, list_some
 from visdom_plugin.geometry.cameras import Cameras
 
 MaskOrigin = Literal["given", "missing", "hull", "colour", "whole"]
@@ -55,6 +55,12 @@ class Views:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def __repr__(self) -> str:
+        width, height = self.cameras.width, self.cameras.height
+        sizes = sorted(set(zip(width.tolist(), height.tolist(), strict=True)))
+        shown = " and ".join(f"{w} x {h}" for w, h in sizes[:2]) + " and more" * (len(sizes) > 2)
+        return f"Views({len(self)} of {shown or 'no'} pixels: {list_some(self.names)})"
 
     def ignored(self, index: int) -> Tensor | None:
         """(H, W) bool of one view, or None where nothing is ignored."""
@@ -148,6 +154,9 @@ class Scene:
     """Exact surface where it is known: vertices (V, 3) float64 and faces (F, 3) int64, outward."""
     read_points: Callable[[], tuple[Tensor, Tensor] | None] | None = field(default=None, compare=False)
     """Reads the points that structure from motion found; None where the data has none. Ask `points`."""
+
+    def __repr__(self) -> str:
+        return f"Scene({self.name!r}, train={self.train!r}, test={self.test!r})"
 
     @cached_property
     def points(self) -> tuple[Tensor, Tensor] | None:
