@@ -134,7 +134,8 @@ def test_samples_may_be_evenly_spaced(scene, hull):  # noqa: F811
         torch.nn.functional.normalize(torch.randn(5, 3)),
     )
     bounded = even.bound(*rays, [])
-    level, _ = even._look("coarse", bounded, torch.full((5,), 0.001), None, 12, 1.0, None)
+    squares = even._mean_squares()[0]
+    level, _ = even._look("coarse", bounded, torch.full((5,), 0.001), None, 12, 1.0, None, squares)
     expected = bounded.near[:, None] + level.s * (bounded.far - bounded.near)[:, None]
     torch.testing.assert_close(level.t, expected)
     assert HULL.bounds_scale == 1.0

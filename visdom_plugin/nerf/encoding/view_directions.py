@@ -10,7 +10,7 @@ from torch import Tensor
 
 from visdom_plugin.compute.kernels import kernel
 from visdom_plugin.compute.parallel import parallel_for
-from visdom_plugin.geometry.harmonics import basis
+from visdom_plugin.geometry.harmonics import C0, basis, higher
 
 DIRECTIONS_PER_PIECE = 4096
 
@@ -34,9 +34,8 @@ def encode_harmonics(directions: Tensor) -> Tensor:
 
 def _harmonics_torch(directions: Tensor) -> Tensor:
     """The kernel's own lines, each on all directions (N, 3) at once."""
-    out = directions.new_empty(16, len(directions))
-    inspect.unwrap(basis)(3, *directions.unbind(-1), out)
-    return out.T
+    x, y, z = directions.unbind(-1)
+    return torch.stack([torch.full_like(x, C0), *inspect.unwrap(higher)(x, y, z)], -1)
 
 
 def encode_sinusoids(directions: Tensor, degree: int = 4) -> Tensor:

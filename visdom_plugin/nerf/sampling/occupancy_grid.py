@@ -241,8 +241,8 @@ def march_occupied(
         return _march_torch(origins, directions, near, far, step, shift, grid)
     rays = [x.detach().float().contiguous().numpy() for x in (origins, directions, near, far, step, shift)]
     counts = np.empty(len(origins), np.int64)
-    longest = float(((far - near) / step).nan_to_num().max()) if len(origins) else 0.0
-    marks = np.empty((len(origins), int(max(longest, 0.0)) // 64 + 2), np.uint64)
+    longest = np.nan_to_num((rays[3] - rays[2]) / rays[4]).max(initial=0)
+    marks = np.empty((len(origins), int(longest) // 64 + 2), np.uint64)
     parallel_for(
         _count, len(origins), 128, *rays, grid.occupied.numpy(), np.float32(grid.half_side), counts, marks
     )
