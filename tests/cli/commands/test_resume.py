@@ -74,6 +74,9 @@ def test_a_killed_run_of_3dgs_go_vd_ends_bit_for_bit_where_it_would_have(tmp_pat
 
 
 def test_ctrl_c_says_which_command_to_repeat(capsys, monkeypatch):
-    monkeypatch.setattr(check, "load_torch", lambda: signal.raise_signal(signal.SIGINT))
+    def interrupt():
+        raise KeyboardInterrupt  # as Python's own handler does, which a background job does not have
+
+    monkeypatch.setattr(check, "load_torch", interrupt)
     assert check.main(["builtin:duck", "--views", "5"]) == 130
     assert capsys.readouterr().err == "interrupted; repeat with: visdom-check builtin:duck --views 5\n"
