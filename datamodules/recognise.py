@@ -155,7 +155,7 @@ def opening(path: str | Path) -> Iterator[Path]:
 
 
 _SCENE_TODO = (
-    "pass --data with the folder of a scene or a built-in scene, or leave it out for the first of them: "
+    "name the folder of a scene (--data DIR where the command trains), or a built-in scene: "
     + ", ".join(PREFIX + name for name in NAMES)
 )
 

@@ -122,9 +122,13 @@ def assign_masks(capture: Capture, wanted: Sequence[int], request: Request) -> M
             todo = f"save masks as PNG, each named like its image, such as {looked}"
         # Where no view has a mask there is nothing to carve the others' from.
         if found or named.keys() - set(open_ones):
-            todo += "; or say what becomes of views without: --data.missing-masks colour|hull"
+            todo += "; or leave views without out, with --train-list and --test-list; or keep them: "
+            todo += (
+                "--data.missing-masks colour (they train colours only) or hull (the hull draws their masks)"
+            )
         raise SceneError(
-            f"{len(missing)} of the images have no mask: {list_some([stem(photographs[i][0]) for i in missing])}",
+            f"{len(missing)} of the images {'has' if len(missing) == 1 else 'have'} no mask: "
+            + list_some([stem(photographs[i][0]) for i in missing]),
             where=path,
             cause=cause,
             todo=todo,
