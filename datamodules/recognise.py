@@ -154,10 +154,7 @@ def opening(path: str | Path) -> Iterator[Path]:
         ) from error
 
 
-_SCENE_TODO = (
-    "name the folder of a scene (--data DIR where the command trains), or a built-in scene: "
-    + ", ".join(PREFIX + name for name in NAMES)
-)
+_SCENE_TODO = "name the folder of a scene, or a built-in scene: " + ", ".join(PREFIX + name for name in NAMES)
 
 
 def find_folder(path: str | Path, todo: str = _SCENE_TODO) -> Path:

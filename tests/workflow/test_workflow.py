@@ -114,7 +114,7 @@ def test_a_folder_is_found_again_with_its_options(tmp_path, monkeypatch):
         (lambda s, r: vd.load(train_lst="all"), "did you mean 'train_list'"),
         (lambda s, r: vd.load(downscale="x"), "downscale cannot be 'x'"),
         (lambda s, r: vd.load(train_list=[0, 1]), "where: train_list\n"),
-        (lambda s, r: vd.load("nowhere"), "pass data with the folder"),
+        (lambda s, r: vd.load("nowhere"), "name the folder of a scene"),
         (lambda s, r: vd.carve(s, kk=2), "carve has no setting 'kk'; did you mean 'k'"),
         (lambda s, r: vd.train("3dgsgo", s), "did you mean '3dgs-go'"),
         (lambda s, r: vd.train("ingp", s, step=3), "did you mean 'steps'"),
@@ -145,7 +145,7 @@ def test_errors_name_arguments_and_the_nearest_name(call, said, scene, run, tmp_
 def test_an_error_keeps_its_topic():
     with pytest.raises(vd.VisDomError) as error:
         vd.load("nowhere")
-    assert error.value.topic == "no-scene" and "data" in error.value.todo
+    assert error.value.topic == "no-scene" and "folder of a scene" in error.value.todo
 
 
 def test_inverted_masks_are_refused_as_by_the_command(tmp_path):
