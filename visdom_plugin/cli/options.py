@@ -267,9 +267,8 @@ def describe_reading(common: Common) -> dict[str, Any]:
     path = common.data if folder is None else folder.expanduser().resolve()
     reading = read_options(common)
     if folder is not None and common.masks is not None and not (folder / common.masks).is_dir():
-        reading["masks"] = str(
-            Path(common.masks).expanduser().resolve()
-        )  # from another working directory, too
+        # The run is opened again from any working directory.
+        reading["masks"] = str(Path(common.masks).expanduser().resolve())
     return {"path": None if path is None else str(path), **reading}
 
 

@@ -7,13 +7,11 @@ Trains what is not in DIR yet, half a minute to a minute each.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from textwrap import fill
 from typing import Any, NamedTuple
 
 from before_after import PICTURES, compare, write_webp
-from trained import train
+from trained import read_options, train
 
 from datamodules import load
 from visdom_plugin.training.runs.run_directory import read_record
@@ -82,11 +80,7 @@ in the [findings](findings/methods.md).
 
 def main() -> None:
     """Draws the pictures and writes the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--runs", type=Path, default=Path("runs/figures"))
-    args = parser.parse_args()
+    args = read_options(__doc__)
     (PICTURES / "gallery").mkdir(exist_ok=True)
     parts = [HEAD]
     for (scene, shown), picture in zip(SCENES.items(), MAKES, strict=True):

@@ -7,7 +7,6 @@ Trains visdom-gs on the first built-in scene where DIR has no such run yet.
 
 from __future__ import annotations
 
-import argparse
 import re
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 from before_after import PICTURES, write_webp
-from trained import train
+from trained import read_options, train
 
 from tests.browser import Page
 
@@ -32,12 +31,7 @@ CLOSE_NOTICES = "document.querySelectorAll('.mantine-Notification-closeButton').
 
 def main() -> None:
     """Draws both pictures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--runs", type=Path, default=Path("runs/figures"))
-    parser.add_argument("--out", type=Path, default=PICTURES)
-    args = parser.parse_args()
+    args = read_options(__doc__, PICTURES)
     run = train(args.runs, "visdom-gs")
     command(run, "report").wait()
     viewer = command(run, "view")

@@ -7,7 +7,6 @@ Trains what is not in DIR yet, half a minute to a minute each.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 import cv2
 from before_after import PICTURES, write_webp
-from trained import train
+from trained import read_options, train
 
 from benchmarks.methods.compare_pictures import draw_runs
 
@@ -43,12 +42,7 @@ WIDTH = 1200
 
 def main() -> None:
     """Draws all sheets."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--runs", type=Path, default=Path("runs/figures"))
-    parser.add_argument("--out", type=Path, default=PICTURES)
-    args = parser.parse_args()
+    args = read_options(__doc__, PICTURES)
     for name, sheet in SHEETS.items():
         runs = [train(args.runs, method, sheet.views) for method in sheet.methods]
         picture = draw_runs(runs, sheet.shown)

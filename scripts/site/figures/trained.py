@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+
+
+def read_options(about: str | None, pictures: Path | None = None) -> argparse.Namespace:
+    """`runs`, the folder of the runs, and `out`, that of the pictures where a script can write them elsewhere."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=Path, default=Path("runs/figures"))
+    if pictures is not None:
+        parser.add_argument("--out", type=Path, default=pictures)
+    return parser.parse_args()
 
 
 def train(folder: Path, method: str, views: int = 4, scene: str = "watering-can") -> Path:
