@@ -1,4 +1,4 @@
-"""Pages of the site from the top of the tree, README, FINDINGS, CHANGELOG and CONTRIBUTING, and from the examples.
+"""Pages of the site from README, FINDINGS, CHANGELOG, CONTRIBUTING and the README of examples, and from its scripts.
 
 Links between those files and docs/ work in the tree, and are turned into the site's here; of a link to any other
 file of the tree the words stay.
@@ -19,19 +19,15 @@ PAGES = {
     "FINDINGS.md": "findings/index.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "examples/README.md": "examples.md",
 }
-"""Files at the top of the tree by their place on the site."""
-EXAMPLES_HEAD = """# Examples
-
-The scripts of `examples/`, in the order to read them, and a notebook. Each runs as it stands; `--help` of a script
-shows its options.
-"""
+"""Files outside docs/ by their place on the site."""
 _CODE = r"^```.*?^```$|`[^`\n]*`"
 _LINK = re.compile(rf"{_CODE}|(!?)\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)", re.M | re.S)
 
 
 def read_page(source: str) -> str:
-    """A file at the top of the tree, for its place on the site."""
+    """A file outside docs/, for its place on the site."""
     return relink((ROOT / source).read_text(encoding="utf-8"), source, PAGES[source])
 
 
@@ -52,8 +48,8 @@ def relink(text: str, source: str, place: str) -> str:
 
 
 def show_examples() -> str:
-    """The scripts and notebooks of examples/ with what they say of themselves."""
-    parts = [EXAMPLES_HEAD]
+    """The README of examples/, then its scripts and notebooks with what they say of themselves."""
+    parts = [read_page("examples/README.md")]
     folder = ROOT / "examples"
     for path in sorted([*folder.rglob("*.py"), *folder.glob("*.ipynb")]):
         show = show_notebook if path.suffix == ".ipynb" else show_script

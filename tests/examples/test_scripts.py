@@ -16,7 +16,7 @@ import pytest
 from visdom_plugin.prepare.demo import DemoConfig, write_demo
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-NOTEBOOK = EXAMPLES / "08_photographs_to_picture.ipynb"
+NOTEBOOK = EXAMPLES / "07_photographs_to_picture.ipynb"
 QUICK = {
     "01_hull_from_arrays": ({"resolution": 32}, "train_005: ", ["hull.ply"]),
     "02_bounds_in_a_nerf": (
@@ -31,7 +31,7 @@ QUICK = {
     ),
     "04_gsplat_companion": ({"steps": 8, "count": 200, "downscale": 5}, "200 Gaussians became ", []),
     "05_nerfacc_estimator": ({"steps": 17, "rays": 50, "downscale": 10}, " cells may be occupied, ", []),
-    "07_table": (
+    "06_table": (
         {"steps": 2, "downscale": 10, "out": Path("two")},
         "| in the visible domain |",
         ["two/table.html"],
@@ -69,6 +69,14 @@ def test_examples_are_short_and_say_what_they_are_for_and_how_they_are_called():
                 w.lstrip("-").removeprefix("no-").replace("-", "_") for w in line.split() if w[:2] == "--"
             }
             assert options <= set(re.findall(r"(\w+): [\w| ]+ = ", source)), line
+
+
+def test_the_readme_lists_every_example_in_order_without_a_gap():
+    there = [path.name for path in sorted([*EXAMPLES.glob("*.py"), *EXAMPLES.glob("*.ipynb")])]
+    packages = [f"{path.parent.name}/" for path in sorted(EXAMPLES.glob("*/pyproject.toml"))]
+    listed = re.findall(r"^\| `([^`]+)` \|", (EXAMPLES / "README.md").read_text(encoding="utf-8"), re.M)
+    assert listed == there + packages
+    assert [int(name[:2]) for name in there] == list(range(1, len(there) + 1))
 
 
 def test_a_script_takes_its_settings_from_the_command_line(tmp_path):

@@ -1,19 +1,21 @@
 """The README's picture: four photographs, and unseen views by methods without and with the visible domain.
 
-for m in zipnerf-lite zipnerf-lite+vd 3dgs-go visdom-gs; do visdom-train method:$m --views 4 --out runs/$m; done
-python scripts/site/figures/before_after.py runs/zipnerf-lite runs/zipnerf-lite+vd runs/3dgs-go runs/visdom-gs
+python scripts/site/figures/before_after.py [--runs DIR] [--out DIR]
+
+The runs are those of the gallery. What is not in DIR yet is trained, half a minute to a minute each, by
+OMP_NUM_THREADS=1 visdom-train method:NAME --data builtin:watering-can --views 4 --budget quick
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
+from trained import read_options, train
 
 from datamodules import load
 from visdom_plugin import Scene, Views
@@ -26,34 +28,31 @@ PICTURES = Path(__file__).parents[3] / "docs" / "pictures"
 MAKES = ("before_after.webp",)
 VIEWS = (4, 11)
 """Test views that are shown."""
+METHODS = ("zipnerf-lite", "zipnerf-lite+vd", "3dgs-go", "visdom-gs")
 TITLES = {
+    "ingp": "Instant-NGP",
+    "ingp+vd": "Instant-NGP\n+ visible domain",
     "zipnerf-lite": "Zip-NeRF",
     "zipnerf-lite+vd": "Zip-NeRF\n+ visible domain",
     "3dgs-go": "Gaussian splatting",
-    "visdom-gs": "visdom-gs: splatting\n+ visible domain",
+    "3dgs-go+vd": "Gaussian splatting\n+ visible domain",
+    "visdom-gs": "visdom-gs",
 }
+"""What pictures call the methods, here and in the gallery."""
 
 
 def main() -> None:
-    """Draws the runs that are named."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("runs", nargs="+", type=Path)
-    parser.add_argument("--out", type=Path, default=PICTURES / "before_after.webp")
-    args = parser.parse_args()
-    scene = load(None, views=4)
-    write_webp(compare(scene, args.runs, VIEWS, TITLES), args.out)
+    """Draws the picture."""
+    args = read_options(__doc__, PICTURES)
+    runs = [train(args.runs, method) for method in METHODS]
+    write_webp(compare(load(None, views=4), runs, VIEWS), args.out / MAKES[0])
 
 
-def compare(
-    scene: Scene, runs: Sequence[Path], shown: Sequence[int], titles: Mapping[str, str]
-) -> np.ndarray:
+def compare(scene: Scene, runs: Sequence[Path], shown: Sequence[int]) -> np.ndarray:
     """(H, W, 3) uint8: the scene's photographs, then unseen views in truth and by finished runs.
 
     Args:
         shown: positions of the test views, a row each.
-        titles: of the runs, by method.
     """
     names = picture_names(scene.test.names)
     columns = [("truth", [on_white(scene.test, i) for i in shown])]
@@ -61,7 +60,7 @@ def compare(
         record = read_record(run)
         psnr = record["metrics"]["test"]["psnr"]
         pictures = [cv2.imread(str(run / "renders/test" / f"{names[i]}.png"))[..., ::-1] for i in shown]
-        columns.append((f"{titles[record['method']]}\n{psnr:.1f} dB", pictures))
+        columns.append((f"{TITLES[record['method']]}\n{psnr:.1f} dB", pictures))
     return draw([on_white(scene.train, i) for i in range(len(scene.train))], columns)
 
 

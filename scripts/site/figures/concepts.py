@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from before_after import PICTURES, pixels_of, write_webp
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap, to_rgb
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from trimesh import Trimesh
 from trimesh.intersections import mesh_plane
@@ -28,8 +28,7 @@ from visdom_plugin.splat.rasterise import rasterise
 
 MAKES = tuple(f"concept_{name}.webp" for name in ("visual_hull", "k", "band", "outside_loss", "inner_shape"))
 HULL, INNER, TRUTH, BAND = "#7aa6d8", "#2b6cb0", "#c53030", "#dd9b1f"
-SEEN = ListedColormap(["#ffffff", "#eef2f7", "#d9e2ee", "#bfd0e4", "#9dbbdb"])
-"""Colours of space by how many of four cameras see it."""
+DOMAIN, RIM = "#d6d6d6", "#808080"
 
 
 class Plane:
@@ -131,12 +130,16 @@ def seen_and_masked(cameras: Cameras, masks, points: np.ndarray) -> tuple[np.nda
     return seen.numpy().reshape(shape), inside.numpy().reshape(shape)
 
 
-def panels(count: int, size: float, tall: float | None = None) -> tuple[Figure, list[Axes]]:
-    """A row of panels without axes, square ones unless `tall` is given, in inches."""
+def panels(count: int, size: float, tall: float | None = None, rows: int = 1) -> tuple[Figure, list[Axes]]:
+    """Rows of panels without axes, the top row first; square panels unless `tall` is given, in inches."""
     tall, title = size if tall is None else tall, 0.32
-    figure = Figure((count * size, tall + title), dpi=110, facecolor="white")
-    wide, high = 1 / count, tall / (tall + title)
-    axes = [figure.add_axes((i * wide + 0.005, 0.01, wide - 0.01, high - 0.01)) for i in range(count)]
+    figure = Figure((count * size, rows * tall + title), dpi=110, facecolor="white")
+    wide, high = 1 / count, tall / (rows * tall + title)
+    axes = [
+        figure.add_axes((i * wide + 0.005, row * high + 0.01, wide - 0.01, high - 0.01))
+        for row in reversed(range(rows))
+        for i in range(count)
+    ]
     for a in axes:
         a.set_xticks([])
         a.set_yticks([])
@@ -172,16 +175,22 @@ def draw_visual_hull(scene: Scene) -> Figure:
 
 
 def draw_k(scene: Scene) -> Figure:
-    """A level cut: how many cameras see each point, and what is kept with K = 1 to 4."""
-    plane = level_plane(scene, 4.7, 0.02)
-    seen, masked = seen_and_masked(scene.train.cameras, scene.train.masks, plane.points)
-    figure, axes = panels(4, 3.2)
-    for a, k in zip(axes, (1, 2, 3, 4), strict=True):
-        plane.show(a, seen.sum(0), cmap=SEEN, vmin=-0.5, vmax=4.5)
-        plane.fill(a, (seen.sum(0) >= k) & (masked | ~seen).all(0), INNER)
-        plane.outline(a, mesh_of(scene))
-        mark_cameras(a, plane, scene.train.cameras)
-        a.set_title(f"K = {k}", size=12)
+    """A level and an upright cut with K = 1 to 4: what K cameras see, and what is kept of it."""
+    level = level_plane(scene, 4.7, 0.02)
+    # Across the spout, where two cameras alone agree on something beside the can.
+    upright = Plane(np.array([1.97, -1.1, 0.5]), np.eye(3)[1], np.eye(3)[2], (-2.4, 2.4, -2.4, 2.4), 0.01)
+    figure, axes = panels(4, 3.2, rows=2)
+    for row, plane in enumerate((level, upright)):
+        seen, masked = seen_and_masked(scene.train.cameras, scene.train.masks, plane.points)
+        for k in (1, 2, 3, 4):
+            a, domain = axes[4 * row + k - 1], seen.sum(0) >= k
+            plane.fill(a, domain, DOMAIN)
+            a.contour(*plane.flat(plane.points).transpose(2, 0, 1), domain, [0.5], colors=RIM, linewidths=0.8)
+            plane.fill(a, domain & (masked | ~seen).all(0), INNER)
+            plane.outline(a, mesh_of(scene))
+            if plane is level:
+                mark_cameras(a, plane, scene.train.cameras)
+                a.set_title(f"K = {k}", size=12)
     return figure
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from textwrap import fill
 from typing import Any, NamedTuple
 
-from before_after import PICTURES, compare, write_webp
+from before_after import PICTURES, TITLES, compare, write_webp
 from trained import read_options, train
 
 from datamodules import load
@@ -53,19 +53,13 @@ SCENES = {
         "Instant-NGP. Splatting smears the rungs below the seat.",
     ),
 }
-METHODS = {
-    "ingp": "Instant-NGP",
-    "ingp+vd": "Instant-NGP\n+ visible domain",
-    "3dgs-go": "Gaussian splatting",
-    "3dgs-go+vd": "Gaussian splatting\n+ visible domain",
-    "visdom-gs": "visdom-gs",
-}
+METHODS = ("ingp", "ingp+vd", "3dgs-go", "3dgs-go+vd", "visdom-gs")
 MAKES = tuple(f"gallery/{name}.webp" for name in SCENES)
 HEAD = """# Gallery
 
-The four built-in scenes from **four photographs**: views that no method has seen, beside the truth. The scenes
-are drawn when they are asked for, so every command here runs as it stands. The small pictures at the left are
-all that a method gets, with their masks and poses.
+To choose a method by eye: the four built-in scenes from **four photographs**, in views that no method has seen,
+beside the truth. The scenes are drawn when they are asked for, so every command here runs as it stands, and you can
+make each picture yourself. The small pictures at the left are all that a method gets, with their masks and poses.
 
 `ingp` is a radiance field, `3dgs-go` is Gaussian splatting, and `+vd` adds the [visible domain](concepts.md).
 `visdom-gs` is `3dgs-go+vd` that starts in the [shape inside the hull](concepts.md#the-shape-inside-the-hull).
@@ -86,7 +80,7 @@ def main() -> None:
     for (scene, shown), picture in zip(SCENES.items(), MAKES, strict=True):
         runs = [train(args.runs, method, scene=scene) for method in METHODS]
         found = load(f"builtin:{scene}", views=4)
-        write_webp(compare(found, runs, shown.views, METHODS), PICTURES / picture, 80)
+        write_webp(compare(found, runs, shown.views), PICTURES / picture, 80)
         parts.append(section(scene, shown, picture, [read_record(run) for run in runs]))
     PICTURES.with_name("gallery.md").write_text("\n".join(parts), encoding="utf-8")
 
@@ -99,7 +93,7 @@ def section(scene: str, shown: Shown, picture: str, records: list[dict[str, Any]
         for record in records
         for found in [record["metrics"]["test"]]
     ]
-    columns = ", ".join(title.replace("\n", " ") for title in METHODS.values())
+    columns = ", ".join(TITLES[method].replace("\n", " ") for method in METHODS)
     lines = [
         f"## {shown.title}",
         "",

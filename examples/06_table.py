@@ -3,8 +3,8 @@
 A table is a YAML file; `visdom-table two.yaml` makes the same one. Interrupted runs are resumed, and finished ones
 are used again.
 
-    python examples/07_table.py
-    python examples/07_table.py --steps 20 --downscale 4     # a quick look, in another folder: --out quick
+    python examples/06_table.py
+    python examples/06_table.py --steps 20 --downscale 4     # a quick look, in another folder: --out quick
 """
 
 import sys
