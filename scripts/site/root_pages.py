@@ -1,4 +1,4 @@
-"""Pages of the site from README, FINDINGS, CHANGELOG, CONTRIBUTING and the README of examples, and from its scripts.
+"""Pages of the site from README, FINDINGS, CHANGELOG, CONTRIBUTING, and from README and scripts of the examples.
 
 Links between those files and docs/ work in the tree, and are turned into the site's here; of a link to any other
 file of the tree the words stay.

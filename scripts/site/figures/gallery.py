@@ -58,8 +58,8 @@ MAKES = tuple(f"gallery/{name}.webp" for name in SCENES)
 HEAD = """# Gallery
 
 To choose a method by eye: the four built-in scenes from **four photographs**, in views that no method has seen,
-beside the truth. The scenes are drawn when they are asked for, so every command here runs as it stands, and you can
-make each picture yourself. The small pictures at the left are all that a method gets, with their masks and poses.
+beside the truth. The scenes are drawn when they are asked for, so every command here runs as it stands. The small
+pictures at the left are all that a method gets, with their masks and poses.
 
 `ingp` is a radiance field, `3dgs-go` is Gaussian splatting, and `+vd` adds the [visible domain](concepts.md).
 `visdom-gs` is `3dgs-go+vd` that starts in the [shape inside the hull](concepts.md#the-shape-inside-the-hull).
