@@ -109,6 +109,8 @@ class LoadedView(NamedTuple):
     """False where the data has no mask for it; then `mask` is True everywhere."""
     soft: float = 0.0
     """Share of the mask's pixels that are neither black nor white."""
+    grey: float = 0.0
+    """Share of the mask's pixels that are not even nearly so; much of it, and it may be no mask."""
     remarks: tuple[str, ...] = ()
     """How its files were understood, where that is not plain."""
 

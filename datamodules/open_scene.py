@@ -21,6 +21,7 @@ from torch import Tensor
 
 from datamodules.capture import Capture, Frame, LoadedView, Pools
 from datamodules.files.colmap_points import read_points
+from datamodules.files.not_a_mask import DOUBTFUL
 from datamodules.files.paths import check_name, inside, printable, stem
 from datamodules.hashing import hash_parts
 from datamodules.request import Request
@@ -49,6 +50,8 @@ class Chosen(NamedTuple):
     """The training views, then the test views, each file under the name that it has on disk."""
     notes: list[str]
     """How files were found, where that is not plain."""
+    request: Request
+    """The request, with its folder of masks as it is called below the scene's."""
 
 
 def choose_files(capture: Capture, request: Request) -> Chosen:
@@ -66,6 +69,8 @@ def choose_files(capture: Capture, request: Request) -> Chosen:
             todo="copy or export the poses again",
             topic="no-scene",
         )
+    if request.masks is not None:
+        request = replace(request, masks=below_root(request.masks, capture.root))
     _check_names(capture, request)
     names = [frame.name for frame in capture.frames]
     folder, factor = _photographs(capture, request.downscale / capture.shrunk, request)
@@ -80,12 +85,12 @@ def choose_files(capture: Capture, request: Request) -> Chosen:
         split = choose_named(capture.root, names, request)
     wanted = [*split.train, *split.test]
     _refuse_absent(there, [asked[i] for i in wanted if found[i] is None])
-    masks = assign_masks(capture, wanted, _name_masks(capture, request))
+    masks = assign_masks(capture, wanted, request)
     ignored = find_ignored(capture, wanted, request)
     files = [
         _files(capture.frames[i], found[i] or asked[i], masks.of[i], ignored.get(i), there) for i in wanted
     ]
-    return Chosen(split, folder, factor, files, [*notes, *masks.notes])
+    return Chosen(split, folder, factor, files, [*notes, *masks.notes], request)
 
 
 class FreeViews(NamedTuple):
@@ -109,13 +114,6 @@ def find_free_views(capture: Capture, request: Request) -> FreeViews | None:
     return FreeViews(tuple(capture.frames[i].name for i in free), capture.calibrate(free).cameras)
 
 
-def _name_masks(capture: Capture, request: Request) -> Request:
-    """The request with its folder of masks as it is called below the scene's."""
-    if request.masks is None:
-        return request
-    return replace(request, masks=below_root(request.masks, capture.root))
-
-
 def open_capture(capture: Capture, request: Request) -> Scene:
     """The scene of a request.
 
@@ -128,8 +126,7 @@ def open_capture(capture: Capture, request: Request) -> Scene:
         SceneError: for every fault of the data.
         ConfigError: for a list given by hand that does not fit the data.
     """
-    split, folder, factor, files, found = choose_files(capture, request)
-    request = _name_masks(capture, request)
+    split, folder, factor, files, found, request = choose_files(capture, request)
     names = [frame.name for frame in capture.frames]
     calibration = capture.calibrate([*split.train, *split.test])
     reader = ViewReader(files, calibration, factor, request.downscale / capture.shrunk, capture, request)
@@ -179,7 +176,17 @@ def open_capture(capture: Capture, request: Request) -> Scene:
     cloud = None
     if capture.points_file is not None:
         cloud = partial(_read_points, capture.root, capture.points_file, request.allow_outside)
-    return Scene(name, train, test, capture.units, source, notes=notes, read_points=cloud)
+    return Scene(
+        name,
+        train,
+        test,
+        capture.units,
+        source,
+        notes=notes,
+        all_train=split.all_train,
+        grey_masks=_doubt_grey(train.names, loaded),
+        read_points=cloud,
+    )
 
 
 def _read_points(root: Path, file: str, outside: bool) -> tuple[Tensor, Tensor] | None:
@@ -332,6 +339,20 @@ def _note_soft(loaded: Sequence[LoadedView]) -> list[str]:
     return [f"soft masks: {mean:.1%} of their pixels are neither black nor white, cut at one half"] * (
         mean > 1e-3
     )
+
+
+def _doubt_grey(names: Sequence[str], loaded: Sequence[LoadedView]) -> dict[str, float]:
+    """Views whose mask is grey for too large a part, and that share; a warning tells of them."""
+    found = {n: v.grey for n, v in zip(names, loaded, strict=True) if v.masked and v.grey > DOUBTFUL}
+    if found:
+        log.warning(
+            "%d of %d masks may be none: up to %.0f%% of their pixels are neither black nor white, cut at one "
+            "half; masks are white on the object and black around it",
+            len(found),
+            len(loaded),
+            100 * max(found.values()),
+        )
+    return found
 
 
 def _note_remarks(loaded: Sequence[LoadedView]) -> list[str]:

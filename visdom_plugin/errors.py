@@ -13,7 +13,7 @@ TOPICS = (
     "scene", "empty-hull", "setting", "run", "plugin",
     # photographs, masks and poses on disk
     "no-scene", "layout", "missing-file", "damaged-file", "outside-path", "photograph", "photograph-size",
-    "mask-missing", "mask-ambiguous", "poses", "lens", "which-views", "depth",
+    "mask-missing", "mask-ambiguous", "mask-grey", "poses", "lens", "which-views", "depth",
     # preparing photographs
     "no-board", "several-lenses", "focal-length", "no-object", "unmatched-poses",
     # settings, runs, what is installed, and trainers

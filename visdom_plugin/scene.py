@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -150,6 +150,10 @@ class Scene:
     """Where it came from, for run.json: root, layout, downscale, hashes of the files read."""
     notes: Sequence[str] = ()
     """What the reader has to say about how it understood the data, one line each."""
+    all_train: bool = False
+    """Whether so many views were asked for that those train, too, which are for testing otherwise."""
+    grey_masks: Mapping[str, float] = field(default_factory=dict)
+    """Training views whose mask may be none, as much of it is neither black nor white: that share, by name."""
     mesh: tuple[Tensor, Tensor] | None = None
     """Exact surface where it is known: vertices (V, 3) float64 and faces (F, 3) int64, outward."""
     read_points: Callable[[], tuple[Tensor, Tensor] | None] | None = field(default=None, compare=False)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from datamodules.files import images
+from datamodules.files.not_a_mask import COLOURFUL, is_colourful
 from visdom_plugin.errors import SceneError
 
 MOST_ENLARGED = 10
@@ -23,7 +24,6 @@ _VOID = 255
 _VOC_VOID = 192 << 16 | 224 << 8 | 224  # blue, green, red of Pascal VOC's outlines
 _SOLID = 0.25
 _NEARLY_FULL = 0.93
-_COLOURFUL = 16  # of 255, between a colour's channels: less comes of reducing a grey picture to a palette
 _SOFT = (0.02, 0.98)
 _AGREED = 0.01
 
@@ -39,6 +39,8 @@ class Mask(NamedTuple):
     """Whether the file's values are numbers of objects: 0 is background, all others are object."""
     unknown: np.ndarray | None = None
     """(H, W) bool, True where the file says that nothing is known; None where it never does."""
+    colourful: bool = False
+    """`not_a_mask.is_colourful` of a file whose brightness is the mask."""
 
 
 def fits(size: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -75,7 +77,7 @@ def decode_mask(data: bytes, path: Path) -> Mask:
             unknown = None if void is None else numbers == void
             known = numbers > 0 if unknown is None else (numbers > 0) & ~unknown
             return Mask(known.astype(np.float32), 0.0, True, unknown)
-        return _measured(colour)
+        return _measured(colour)._replace(colourful=is_colourful(pixels))
     alpha = alpha.astype(np.float32) / full
     # A cut-out's colours are a photograph; only colours that are black and white could be meant as a mask.
     if colour.min() != colour.max() and soft_share(colour) < _AGREED and _differ(colour, alpha):
@@ -98,7 +100,7 @@ def _find_labels(data: bytes, path: Path, pixels: np.ndarray) -> tuple[np.ndarra
     if (paletted := images.decode_palette(data, path)) is not None:
         indices, palette = paletted
         used = np.unique(indices)
-        if len(used) > 1 and np.ptp(palette[used].astype(int), axis=1).max() > _COLOURFUL:
+        if len(used) > 1 and np.ptp(palette[used].astype(int), axis=1).max() > COLOURFUL:
             black = used[~palette[used].any(1)]
             if len(black) and black[0] != 0:
                 raise SceneError(
@@ -144,7 +146,7 @@ def _find_labels(data: bytes, path: Path, pixels: np.ndarray) -> tuple[np.ndarra
 
 def _find_coloured_labels(pixels: np.ndarray) -> tuple[np.ndarray, int | None] | None:
     """The same for (H, W, C) BGR pixels in a few colours that fill areas, black being background."""
-    if pixels.dtype != np.uint8 or np.ptp(pixels[..., :3], axis=2).max() <= _COLOURFUL:
+    if pixels.dtype != np.uint8 or np.ptp(pixels[..., :3], axis=2).max() <= COLOURFUL:
         return None
     codes = pixels[..., :3].astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
     used, labels = np.unique(codes, return_inverse=True)

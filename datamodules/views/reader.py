@@ -15,6 +15,7 @@ import torch
 
 from datamodules.capture import Calibration, Capture, Frame, InspectedView, LoadedView
 from datamodules.files import images, masks
+from datamodules.files.not_a_mask import grey_share, refuse_photograph
 from datamodules.files.paths import printable, read_file
 from datamodules.files.undistort import undistort
 from datamodules.request import Request
@@ -78,6 +79,9 @@ class ViewReader:
             side_files.refuse_unmasked(reading, file, photo)
         soft = np.ones((1, 1), np.float32) if opacity is None else opacity
         image = photo.decode()
+        if found.colourful is not None:
+            refuse_photograph(soft, found.colourful, image, mask_path)
+        grey = grey_share(soft) if masked else 0.0
         unknown = side_files.read_ignored(reading, file, photo, found, self._choose_turns)
         if distortion is not None:
             scaled = self._K[i] * np.array([[photo.size[0] / full[0]], [photo.size[1] / full[1]], [1.0]])
@@ -109,6 +113,7 @@ class ViewReader:
             depth=depth,
             masked=masked,
             soft=masks.soft_share(soft) if masked else 0.0,
+            grey=grey,
             remarks=remarks,
         )
 
@@ -128,9 +133,12 @@ class ViewReader:
         missing_allowed = reading.request.allow_missing_masks
         void, masked = False, photo.alpha and reading.request.mask_source != "folder"
         if file.mask is not None or (masked and missing_allowed):
-            soft, unknown, mask_path, _ = side_files.read_mask(reading, file, photo, lambda: (0, False))
-            masked, void = soft is not None, unknown is not None
+            found = side_files.read_mask(reading, file, photo, lambda: (0, False))
+            soft, mask_path = found.opacity, found.path
+            masked, void = soft is not None, found.unknown is not None
             if soft is not None:
+                if found.colourful is not None:
+                    refuse_photograph(soft, found.colourful, None, mask_path)
                 mask = side_files.resize(soft, *photo.target) > 0.5
                 masks.refuse_empty(mask, float(soft.max()), mask_path)
         if not masked and not missing_allowed:

@@ -34,6 +34,8 @@ class FoundMask(NamedTuple):
     path: Path
     remarks: tuple[str, ...] = ()
     """How it was understood, where that is not plain."""
+    colourful: bool | None = None
+    """Of a mask's file, as `masks.Mask` has it; None where the alpha channel is the mask."""
 
 
 def read_mask(reading: Reading, file: Frame, photo: Photograph, choose_turns: ChooseTurns) -> FoundMask:
@@ -56,7 +58,7 @@ def _find_mask(reading: Reading, file: Frame, photo: Photograph, choose_turns: C
     found, path, remarks = _read_turned(reading, file.mask, photo, "mask", choose_turns)
     if alpha is not None:
         masks.refuse_two(found, alpha, path, photo.path)
-    return FoundMask(found.opacity, found.unknown, path, remarks)
+    return FoundMask(found.opacity, found.unknown, path, remarks, found.colourful)
 
 
 def read_ignored(

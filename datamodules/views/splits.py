@@ -38,6 +38,8 @@ class Split:
     """How the views were chosen, for people."""
     free: tuple[int, ...] = ()
     """Of views spread evenly: all that they were spread over."""
+    all_train: bool = False
+    """Whether views train that are for testing where fewer are asked for."""
 
 
 def every_eighth(positions: Sequence[int]) -> Pools:
@@ -70,7 +72,7 @@ def choose(
             length than its name says, or shares a view with the other; too few views.
         ConfigError: the same of a list given by hand.
     """
-    count, hashes, rules = len(names), {}, []
+    count, hashes, rules, all_train = len(names), {}, [], False
     train = held = None
     train_where, test_where = "--train-list", "--test-list"
     files = _index_files(root)
@@ -121,13 +123,14 @@ def choose(
             if request.train_list != ALL:
                 rules = [f"all {len(every)} views train, there are no more than the {wanted} wanted"]
                 log.info("%s: %s", root, rules[0])
-            return Split(every, held if listed and request.test else [], hashes, "; ".join(rules))
+            tested = held if listed and request.test else []
+            return Split(every, tested, hashes, "; ".join(rules), all_train=request.train_list != ALL)
         pool = [i for i in pools.train if i not in held] if request.hold_out else every
         if not request.test and request.hold_out and len(pool) < (request.views or 1) <= len(every):
             log.info(
                 "%s: %d views are all but those for testing, so these are taken as well", root, len(pool)
             )
-            pool, rules = every, [*rules[:-1], "no view is held out"]
+            pool, rules, all_train = every, [*rules[:-1], "no view is held out"], True
         train, rule = _pick_training(root, names, pool, every, request.views)
         rules.append(rule)
         free = tuple(pool)
@@ -135,7 +138,7 @@ def choose(
         free = ()
     tested = held if request.test else []
     _refuse_shared(train, tested, f"{train_where} and {test_where}", root)
-    return Split(train, tested, hashes, "; ".join(rules), free)
+    return Split(train, tested, hashes, "; ".join(rules), free, all_train)
 
 
 def _pick_training(

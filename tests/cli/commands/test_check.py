@@ -84,6 +84,18 @@ def test_findings_exit_with_1_and_name_the_view(folder, tmp_path, kind, change, 
     assert "1 finding" in shown and shown.count("docs/guide/troubleshooting.md#findings") == 1
 
 
+def test_masks_that_are_photographs_or_grey_are_findings(folder, tmp_path, capsys):
+    spoilt = spoil(folder, tmp_path, lambda m: cv2.GaussianBlur(m, (0, 0), 15))
+    assert main([str(spoilt), "--json"]) == 1
+    (finding,) = (f for f in json.loads(capsys.readouterr().out)["findings"] if f["kind"] == "mask-grey")
+    assert finding["views"] == ["train_001.png"] and "neither black nor white" in finding["what"]
+    shutil.copy(spoilt / "images/train_001.png", spoilt / "masks/train_001.png")
+    assert main([str(spoilt), "--json"]) == 1
+    (finding,) = json.loads(capsys.readouterr().out)["findings"]
+    assert (finding["kind"], finding["sure"]) == ("mask-grey", "certain")
+    assert "is a photograph" in finding["what"] and "alpha channel" in finding["todo"]
+
+
 def test_sheet_and_report_are_written(folder, tmp_path, capsys):
     spoilt = spoil(folder, tmp_path, lambda m: np.roll(m, 12, 1))
     out = tmp_path / "report"

@@ -41,7 +41,7 @@ def test_training_views_are_the_same_whether_test_views_are_asked_for_or_not(
 def test_who_needs_no_test_view_gets_all_views_but_those_listed_for_testing(count, tmp_path):
     names, pools = _names(count), every_eighth(range(count))
     found = choose(tmp_path, names, Request(views=count, test=False), pools)
-    assert found.train == list(range(count)) and f"all {count} views train" in found.rule
+    assert found.train == list(range(count)) and f"all {count} views train" in found.rule and found.all_train
     (tmp_path / "sparse_test.txt").write_text("1")
     assert 1 not in choose(tmp_path, names, Request(views=count - 1, test=False), pools).train
     assert 1 not in choose(tmp_path, names, Request(views=count, test=False), pools).train
@@ -52,7 +52,7 @@ def test_as_few_views_as_are_wanted_all_train(count, tmp_path):
     names, pools = _names(count), every_eighth(range(count))
     for request in (Request(), Request(views=4), Request(views=count), Request(views=4, hold_out=False)):
         found = choose(tmp_path, names, request, pools)
-        assert found.train == list(range(count)) and found.test == []
+        assert found.train == list(range(count)) and found.test == [] and found.all_train
     if count > 1:
         listed = choose(tmp_path, names, Request(views=4, test_list="0"), pools)
         assert listed.train == list(range(1, count)) and listed.test == [0]
@@ -64,7 +64,10 @@ def test_all_views_can_be_asked_for_in_a_word(tmp_path):
     assert found.train == list(range(9)) and found.test == []
     found = choose(tmp_path, names, Request(train_list="all", test_list="v02,5"), pools)
     assert found.train == [0, 1, 3, 4, 6, 7, 8] and found.test == [2, 5]
-    assert len(choose(tmp_path, names, Request(views=4), pools).test) == 2
+    assert not found.all_train
+    found = choose(tmp_path, names, Request(views=4), pools)
+    assert len(found.test) == 2 and not found.all_train
+    assert choose(tmp_path, names, Request(views=8, test=False), pools).all_train
 
 
 def test_the_advice_to_list_views_that_test_works(tmp_path):

@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 
 FOUND = 1
 """Exit status with findings."""
-NONE_LEFT, FEW_VIEWS = ("views train, there are no more", "no view is held out"), 6
-"""Words of the rules by which all views are taken, and how many to train with then: some are left to test on."""
-
+FEW_VIEWS = 6
+"""How many views to train with where all were looked at: some are left to test on."""
 
 _WIDE = (0.8, 1.25)
 """Focal lengths that could be so much shorter, or longer, are worth a line."""
@@ -84,6 +83,7 @@ def _main(argv: Sequence[str]) -> int:
     loaded = time.perf_counter()
     k = None if options.k == "auto" else options.k
     found = check_views(views, masks, k=k, layout=scene.source.get("layout"))
+    found = replace(found, findings=[*doubt_masks(scene, views.names), *found.findings])
     if len(views) < min(2, len(scene.train)):
         count = len(scene.train) - len(views)
         todo = f"make masks for the other {count} views, or name views that have one with --train-list"
@@ -114,7 +114,7 @@ def _main(argv: Sequence[str]) -> int:
         wanted = found.advice.k if found.advice is not None and k is None else k
         k = None if wanted == USUAL_K else wanted
         reading = read_options(options)
-        if any(rule in str(scene.source.get("split")) for rule in NONE_LEFT):
+        if scene.all_train:
             reading["views"] = min(reading["views"], FEW_VIEWS)
         say(f"next: {training_command(folder, reading, longest, k=k)}")
     return FOUND if found.findings else 0
@@ -175,7 +175,27 @@ def find_briefly(scene: Scene) -> list[dict[str, Any]]:
 
     views, masks = carving_views(scene.train)
     found = check_views(views, masks, brief=True, layout=scene.source.get("layout"))
+    found = replace(found, findings=[*doubt_masks(scene, views.names), *found.findings])
     return describe_check(found, views.names)["findings"]
+
+
+def doubt_masks(scene: Scene, names: Sequence[str]) -> list[Finding]:
+    """The finding on masks that may be none, as the reader of the scene told; an empty list where there are none.
+
+    Args:
+        names: of the views that are checked.
+    """
+    from visdom_plugin.hull.checks.findings import Finding, Name, spell_range
+
+    views = tuple(i for i, name in enumerate(names) if name in scene.grey_masks)
+    if not views:
+        return []
+    shares = [scene.grey_masks[names[i]] for i in views]
+    whose = Name(names).masks_of(views, "may be none", "may be none")
+    share = spell_range(shares, ".0%")
+    what = f"{whose}: {share} of the pixels are neither black nor white; they are cut at one half"
+    todo = "look at the files: masks are white on the object and black around it, grey on its outline alone"
+    return [Finding("mask-grey", what, views, "likely", max(shares), todo)]
 
 
 @phase("checking cameras and masks")
@@ -241,7 +261,7 @@ def _is_about_a_mask(error: SceneError, folder: Path) -> bool:
 
 
 def _unreadable(error: SceneError) -> dict[str, Any]:
-    kind = error.topic if error.topic in ("empty", "size") else "mask"
+    kind = error.topic if error.topic in ("empty", "size", "mask-grey") else "mask"
     what = error.what + (f" ({error.cause})" if error.cause else "")
     return {
         "kind": kind,
@@ -303,13 +323,24 @@ def summarise_fit(report: dict[str, Any]) -> list[str]:
         )
     if report.get("choice"):
         lines.append(report["choice"]["said"])
-    if "misfit" in report:
-        lines += [
-            f"Masks and cameras miss each other by {report['misfit']:.2%} of the object's size on average; 0 is a "
-            "perfect fit.",
-            f"Right beside each mask, the other masks rule the object out by {report['constraint']:.1%} of its "
-            "size on average; the more, the smaller a wrong pose that they notice.",
+    if "misfit" not in report:
+        return lines
+    from visdom_plugin.hull.checks.check import SPEAKING_PX
+    from visdom_plugin.hull.outlines.distance_fields import OBJECT_PX
+
+    if report["constraint"] < SPEAKING_PX / OBJECT_PX:
+        return [
+            *lines,
+            "The masks rule out nothing for one another, so they do not tell whether cameras fit.",
         ]
+    missed = f"asks and cameras miss each other by {report['misfit']:.2%} of the object's size on average"
+    lines.append(
+        f"Apart from what was found, m{missed}." if report["findings"] else f"M{missed}; 0 is a perfect fit."
+    )
+    lines.append(
+        f"Right beside each mask, the other masks rule the object out by {report['constraint']:.1%} of its "
+        "size on average; the more, the smaller a wrong pose that they notice."
+    )
     return lines
 
 

@@ -44,7 +44,8 @@ from visdom_plugin.hull.foreign import to_numpy
 from visdom_plugin.hull.outlines.distance_fields import OBJECT_PX, Outlines, draw_outlines, turn_over
 from visdom_plugin.hull.outlines.silhouette_consistency import Coherence, measure_coherence
 
-_SPEAKING_PX = 0.5
+SPEAKING_PX = 0.5
+"""What masks rule out beside each other, on average; less, and they tell nothing of the cameras."""
 _RAYS, _BRIEF_VIEWS = 1024, 16
 
 
@@ -99,10 +100,9 @@ def check(
     filled = [_filled(m, g) for m, g in zip(own, unknown, strict=True)]
     alone = check_content([m if i not in out else np.eye(2, dtype=bool) for i, m in enumerate(filled)], names)
     found += alone
-    for f in alone:
-        if f.kind == "speckled":
-            own[f.views[0]] = cv2.medianBlur(own[f.views[0]].astype(np.uint8), 3) > 0
-    out |= {f.views[0] for f in alone if f.kind != "speckled"}
+    for view in (view for f in alone if f.kind == "speckled" for view in f.views):
+        own[view] = cv2.medianBlur(own[view].astype(np.uint8), 3) > 0
+    out |= {view for f in alone if f.kind != "speckled" for view in f.views}
     out |= {i for i, m in enumerate(own) if not m.any()}
     usable = np.array([i for i in range(len(own)) if i not in out], np.int64)
     repeated = _repeated(own, images, out, names)
@@ -176,20 +176,25 @@ def _split(found: list[Finding]) -> tuple[list[Finding], list[Finding]]:
 def _repeated(
     masks: Sequence[np.ndarray], images: Sequence[Tensor | np.ndarray], out: set[int], names: Name
 ) -> list[Finding]:
-    """Photographs and masks that occur twice."""
+    """Photographs and masks that occur more than once, one finding for all copies of one."""
     pairs = {p: {"mask"} for p in find_repeated(masks) if not out & set(p)}
     for p in find_repeated([np.asarray(i) for i in images]):
         pairs.setdefault(p, set()).add("photograph")
+    groups: dict[tuple[int, tuple[str, ...]], list[int]] = {}
+    for (first, later), what in sorted(pairs.items()):
+        groups.setdefault((first, tuple(sorted(what))), [first]).append(later)
     return [
         Finding(
             "duplicate",
-            f"{names.all_of(pair)} have the same {' and the same '.join(sorted(what))}, pixel for pixel",
-            pair,
+            f"{names.all_of(views)} have the same {' and the same '.join(what)}, pixel for pixel",
+            tuple(views),
             "certain",
             1.0,
-            "put the right file in the place of the copy, or leave one of the two views out",
+            "put the right file in the place of the copy, or leave one of the two views out"
+            if len(views) == 2
+            else "put the right files in the place of the copies, or leave all but one of these views out",
         )
-        for pair, what in sorted(pairs.items())
+        for (_, what), views in groups.items()
     ]
 
 
@@ -213,7 +218,7 @@ def _inverted(
     if fit.score <= QUIET_PX and after.score > 10 * QUIET_PX:
         return [], outlines
     views = tuple(int(usable[k]) for k in flagged)
-    sound = after.score <= DISAGREE_PX and after.power > max(_SPEAKING_PX, fit.power)
+    sound = after.score <= DISAGREE_PX and after.power > max(SPEAKING_PX, fit.power)
     whose = "all masks are" if len(views) == len(masks) else f"the mask of {names[views[0]]} is"
     if 1 < len(views) < len(masks):
         whose = f"the masks of {names.all_of(views)} are"
@@ -232,7 +237,7 @@ def _inverted(
 
 def _views_alone(causes: list[Suspicion], fit: Coherence) -> bool:
     """Whether something is wrong, and nothing but single views is there to blame."""
-    wrong = bool(causes) or fit.score > DISAGREE_PX or fit.power < _SPEAKING_PX
+    wrong = bool(causes) or fit.score > DISAGREE_PX or fit.power < SPEAKING_PX
     return wrong and all(c.kind == "view" for c in causes)
 
 

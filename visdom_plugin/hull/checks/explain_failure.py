@@ -116,7 +116,9 @@ def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouett
         what = f"{speck}, and covers {covered:.0%} of the masks in the mean"
     elif inside and covered >= POOR_COVERAGE:
         what = f"the hull reaches the cameras: {inside} of {len(cameras)} stand inside it"
-    log.info("the hull covers %.0f%% of the masks; looking for a cause", 100 * covered)
+    log.info(
+        "the hull does not look sound (it covers %.0f%% of the masks); looking for a cause", 100 * covered
+    )
     fault = next(iter(_faults(settings, cameras, silhouettes)), None)
     if fault is not None and fault.kind == "axes" and fault.sure != "possible":
         raise SceneError(what, where=_where(fault), cause=_cause(fault), todo=_todo(fault), topic=fault.kind)
@@ -130,6 +132,8 @@ def find_misfit(settings: HullSettings, cameras: Cameras, silhouettes: Silhouett
             topic="disagreement" if fault is None else fault.kind,
         )
     if covered >= POOR_COVERAGE:
+        cause = "none was found" if fault is None else f"{_cause(fault)}; {_todo(fault)}"
+        log.info("cause: %s; the hull is used as it is", cause)
         return None
     if fault is not None:
         return f"{what}; {_cause(fault)}; {_todo(fault)}"

@@ -19,7 +19,7 @@ class Finding(NamedTuple):
     """One thing that is wrong, or worth knowing."""
 
     kind: str
-    """Machine-readable name, one of `KINDS`."""
+    """Machine-readable name, one of `KINDS`; of masks that may be none, mask-grey."""
     what: str
     """A sentence with the number behind it."""
     views: tuple[int, ...]
@@ -51,3 +51,17 @@ class Name(list[str]):
         if len(names) > most:
             return list_some(names, most)
         return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+
+    def masks_of(self, views: Sequence[int], one: str, many: str) -> str:
+        """ "the mask of a" or "the masks of a and b", with the verb that fits."""
+        return (
+            f"the mask of {self[views[0]]} {one}"
+            if len(views) == 1
+            else (f"the masks of {self.all_of(views)} {many}")
+        )
+
+
+def spell_range(values: Sequence[float], spelled: str) -> str:
+    """ "3" or "3 to 12", from the least to the largest, each formatted as `spelled`."""
+    low, high = (format(x, spelled) for x in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import math
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
 
-from visdom_plugin.hull.checks.findings import Finding, Name
+from visdom_plugin.hull.checks.findings import Finding, Name, Sure, spell_range
 
 CUT_SHARE = 0.2
 """An object is cut off in earnest when the frame's border crosses it along this part of its length; less, such as
@@ -19,82 +21,82 @@ perforated objects reach a quarter of that."""
 
 
 def check_sizes(sizes: np.ndarray, masks: Sequence[np.ndarray], names: Name) -> list[Finding]:
-    """Masks of another size than their cameras' images.
+    """Masks of another size than their cameras' images, one finding for all that are alike.
 
     Args:
         sizes: (N, 2) width and height that the cameras say.
         masks: N arrays (H, W).
     """
-    found = []
+    alike = defaultdict(list)
     for view, mask in enumerate(masks):
-        width, height = (int(s) for s in sizes[view])
-        if mask.shape != (height, width):
-            shape = " x ".join(map(str, mask.shape[::-1]))
-            found.append(
-                Finding(
-                    "size",
-                    f"the mask of {names[view]} is {shape} but its camera's image is {width} x {height}",
-                    (view,),
-                    "certain",
-                    mask.size / (width * height),
-                    "make the mask at the size of the image",
-                )
-            )
-    return found
+        wanted = tuple(int(s) for s in sizes[view])
+        if mask.shape[::-1] != wanted:
+            alike[mask.shape[::-1], wanted].append(view)
+    return [
+        Finding(
+            "size",
+            f"{names.masks_of(views, 'is', 'are')} {is_[0]} x {is_[1]} but the camera's image is "
+            f"{wanted[0]} x {wanted[1]}",
+            tuple(views),
+            "certain",
+            math.prod(is_) / math.prod(wanted),
+            "make masks at the size of their images",
+        )
+        for (is_, wanted), views in alike.items()
+    ]
 
 
 def check_content(masks: Sequence[np.ndarray], names: Name) -> list[Finding]:
-    """Masks that are empty, full or speckled."""
-    found = []
+    """Masks that are empty, full or speckled, one finding of each kind."""
+    empty, full, specks = [], [], {}
     for view, mask in enumerate(masks):
         share = float(mask.mean())
         if share == 0:
-            todo = "mask the object, check the threshold that reads the mask, or leave the view out"
-            said = Finding(
-                "empty", f"the mask of {names[view]} has no foreground pixel", (view,), "certain", 0.0, todo
-            )
+            empty.append(view)
         elif share == 1:
-            todo = "mask the object: no pixel of this mask is background"
-            said = Finding(
-                "full", f"the mask of {names[view]} is all foreground", (view,), "certain", 1.0, todo
-            )
+            full.append(view)
         else:
-            specks, per_outline = count_specks(mask)
-            if specks < _SPECKS or per_outline < _SPECK_SHARE:
-                continue
-            said = Finding(
-                "speckled",
-                f"the mask of {names[view]} is speckled: {specks} single pixels differ from all around them, "
-                f"{per_outline:.1%} of its outline",
-                (view,),
-                "certain" if per_outline > 2 * _SPECK_SHARE else "likely",
-                per_outline,
-                "clean it: a median filter of 3 pixels, or save masks as PNG, never as JPEG",
-            )
-        found.append(said)
+            count, per_outline = count_specks(mask)
+            if count >= _SPECKS and per_outline >= _SPECK_SHARE:
+                specks[view] = count, per_outline
+    found = []
+    if empty:
+        what = names.masks_of(empty, "has no foreground pixel", "have no foreground pixel")
+        todo = "mask the object, check the threshold that reads the mask, or leave the view out"
+        found.append(Finding("empty", what, tuple(empty), "certain", 0.0, todo))
+    if full:
+        what = names.masks_of(full, "is all foreground", "are all foreground")
+        todo = "mask the object: no pixel of such a mask is background"
+        found.append(Finding("full", what, tuple(full), "certain", 1.0, todo))
+    if specks:
+        views = tuple(specks)
+        counts, shares = zip(*specks.values(), strict=True)
+        what = (
+            f"{names.masks_of(views, 'is', 'are')} speckled: {spell_range(counts, 'd')} single pixels differ "
+        )
+        what += f"from all around them, {spell_range(shares, '.1%')} of the outline"
+        sure: Sure = "certain" if max(shares) > 2 * _SPECK_SHARE else "likely"
+        todo = "clean it: a median filter of 3 pixels, or save masks as PNG, never as JPEG"
+        found.append(Finding("speckled", what, views, sure, max(shares), todo))
     return found
 
 
 def check_border(masks: Sequence[np.ndarray], names: Name) -> list[Finding]:
-    """Objects that the border of the image cuts off; those it only grazes share one note."""
-    found, grazed, most = [], [], 0.0
+    """Objects that the border of the image cuts off, in one finding; those it only grazes share one note."""
+    found, cut, grazed, most = [], {}, [], 0.0
     for view, mask in enumerate(masks):
         share = 0.0 if mask.all() else border_contact(mask)
         if 0 < share < CUT_SHARE:
             grazed.append(view)
             most = max(most, share)
         elif share:
-            found.append(
-                Finding(
-                    "border",
-                    f"the mask of {names[view]} runs along the border of the image for {share:.0%} of the "
-                    "object's length: the object is cut off",
-                    (view,),
-                    "certain",
-                    share,
-                    "use a view that shows the whole object, or see that other views show the missing part",
-                )
-            )
+            cut[view] = share
+    if cut:
+        views, shares = tuple(cut), tuple(cut.values())
+        what = f"{names.masks_of(views, 'runs', 'run')} along the border of the image for "
+        what += f"{spell_range(shares, '.0%')} of the object's length: the object is cut off"
+        todo = "use views that show the whole object, or see that other views show the missing part"
+        found.append(Finding("border", what, views, "certain", max(shares), todo))
     if grazed:
         what = f"the border of the image cuts a little off the object in {names.all_of(grazed)}: along up to "
         what += f"{most:.0%} of its length"
