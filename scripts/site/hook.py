@@ -24,6 +24,21 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turns the links of a page of docs/."""
+    """Turns the links of a page of docs/; the contents of a page of wide tables come before its text."""
     place = page.file.src_uri
-    return markdown if page.file.generated_by else root_pages.relink(markdown, f"docs/{place}", place)
+    text = markdown if page.file.generated_by else root_pages.relink(markdown, f"docs/{place}", place)
+    if not is_measured(place):
+        return text
+    page.meta["hide"] = ["toc"]
+    head, first, rest = text.partition("\n## ")
+    return f"{head}\n[TOC]\n{first}{rest}".replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Names the pages of measurements for the style sheet."""
+    return f'<div class="measured">{html}</div>' if is_measured(page.file.src_uri) else html
+
+
+def is_measured(place: str) -> bool:
+    """Whether a page of the site is one of wide tables."""
+    return place == "gpu.md" or (place.startswith("findings/") and place != "findings/index.md")

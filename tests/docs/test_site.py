@@ -5,6 +5,7 @@ import importlib
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -123,6 +124,24 @@ def test_the_page_of_examples_has_every_script_and_notebook(part):
         '{"cells": [{"cell_type": "markdown", "source": ["# A"]}, {"cell_type": "code", "source": ["b"]}]}'
     )
     assert pages.show_notebook("n.ipynb", cells) == "## A\n\n`n.ipynb`\n\n```py\nb\n```\n"
+
+
+def test_pages_of_wide_tables_have_their_contents_in_the_text_and_room_beside_it(part):
+    pytest.importorskip("mkdocs")
+    hook = part("hook")
+
+    def page(place):
+        return SimpleNamespace(file=SimpleNamespace(src_uri=place, generated_by=None), meta={})
+
+    text = "# A\n\nOne.\n\n## B\n\n| 1 ± 2 |\n"
+    wide, narrow = page("findings/hull.md"), page("guide/choosing.md")
+    made = hook.on_page_markdown(text, wide, None, None)
+    assert made == "# A\n\nOne.\n\n[TOC]\n\n## B\n\n| 1\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}2 |\n"
+    assert wide.meta == {"hide": ["toc"]}
+    assert hook.on_page_content("x", wide, None, None) == '<div class="measured">x</div>'
+    assert ".measured" in (ROOT / "docs/assets/site.css").read_text(encoding="utf-8")
+    assert hook.on_page_markdown(text, narrow, None, None) == text and narrow.meta == {}
+    assert hook.on_page_content("x", narrow, None, None) == "x"
 
 
 def test_the_extra_is_bounded():
