@@ -42,6 +42,35 @@ def test_opacity_below_one_is_the_bound_in_value_and_the_identity_in_gradient():
         assert (alpha.grad == 1).all()
 
 
+def mask_loss_by_autograd(alpha, mask, weight, clamp):
+    """Slow twin."""
+    if clamp > 1e-6:
+        alpha, mask = (x.clamp(clamp, 1 - clamp) for x in (alpha, mask))
+    alpha = torch.where(mask < 1, below_one(alpha), alpha.clamp_max(1 - 1e-6)).clamp_min(1e-6)
+    weight = torch.ones_like(alpha) if weight is None else weight
+    entropy = -(mask * alpha.log() + (1 - mask) * (1 - alpha).log())
+    return (weight * entropy).sum() / weight.sum().clamp_min(1)
+
+
+@pytest.mark.parametrize("clamp", [1e-6, 0.01])
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_mask_loss_equals_its_twin(clamp, weighted, dtype):
+    near_one = 1 - torch.logspace(-8, -4, 200, dtype=torch.float64)
+    near_zero = torch.cat([torch.logspace(-8, -2, 200, dtype=torch.float64), torch.zeros(1).double()])
+    alpha = torch.cat([torch.linspace(0, 1.0001, 500).double(), near_one, near_zero]).to(dtype)
+    assert (alpha > 1 - 1e-6).sum() > 20
+    draw = torch.Generator().manual_seed(0)
+    weight = (torch.rand(len(alpha), generator=draw) > 0.3).to(dtype) if weighted else None
+    for mask in (torch.zeros(()), torch.ones(()), torch.tensor(0.3)):
+        results = []
+        for loss in (mask_loss, mask_loss_by_autograd):
+            at = alpha.clone().requires_grad_()
+            value = 3 * loss(at, mask.to(dtype).expand_as(at), weight, clamp)
+            results.append((value.detach(), *torch.autograd.grad(value, at)))
+        torch.testing.assert_close(*results, rtol=1e-5, atol=1e-7)
+
+
 def both_losses(alpha):
     """Of pixels off the object and off the hull."""
     return [mask_loss(alpha, torch.zeros_like(alpha)), outside_loss(alpha, torch.zeros_like(alpha).bool())]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from visdom_plugin.ssim import l1_with_ssim
 
@@ -78,14 +81,34 @@ def mask_loss(alpha: Tensor, mask: Tensor, weight: Tensor | None = None, clamp: 
         clamp: distance from 0 and 1, below 0.5, that opacity and mask keep at least. With more than the default,
             an opacity of 1 - `clamp` meets a mask of 1, and one nearer to 0 or 1 than `clamp` has no gradient.
     """
-    if clamp > 1e-6:
-        alpha, mask = (x.clamp(clamp, 1 - clamp) for x in (alpha, mask))
-    # Inside the mask nothing is gained beyond the upper bound. The lower one stops an unbounded gradient.
-    alpha = torch.where(mask < 1, below_one(alpha), alpha.clamp_max(OPAQUE)).clamp_min(1e-6)
-    if weight is None:
-        return torch.nn.functional.binary_cross_entropy(alpha, mask)
-    total = torch.nn.functional.binary_cross_entropy(alpha, mask, weight, reduction="sum")
-    return total / weight.sum().clamp_min(1)
+    return _CrossEntropy.apply(alpha, mask, weight, clamp)
+
+
+class _CrossEntropy(torch.autograd.Function):
+    """The mask's loss in fewer operations than autograd makes of it; `below_one` says what happens at 1."""
+
+    @staticmethod
+    def forward(ctx: Any, alpha: Tensor, mask: Tensor, weight: Tensor | None, clamp: float) -> Tensor:
+        least, most = max(clamp, 1e-6), min(1 - clamp, OPAQUE)
+        bounded = alpha.clamp(least, most)
+        if clamp > 1e-6:
+            mask = mask.clamp(least, most)
+            inside = bounded == alpha
+        else:
+            # Inside the mask nothing is gained beyond the upper bound. The lower one stops an unbounded gradient.
+            inside = (alpha >= least) & ((alpha <= most) | (mask < 1))
+        count = bounded.numel() if weight is None else weight.sum().clamp_min(1)
+        ctx.save_for_backward(bounded, mask, weight, inside)
+        ctx.count = count
+        total = torch.nn.functional.binary_cross_entropy(bounded, mask, weight, reduction="sum")
+        return total / count
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        bounded, mask, weight, inside = ctx.saved_tensors
+        by_alpha = (bounded - mask) / (bounded * (1 - bounded)) * (slope / ctx.count) * inside
+        return by_alpha if weight is None else by_alpha * weight, None, None, None
 
 
 def disparity_loss(depth: Tensor, alpha: Tensor, mono_depth: Tensor, mask: Tensor) -> Tensor | None:

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from visdom_plugin.nerf.rendering import volume
 from visdom_plugin.nerf.rendering.volume import composite, weights_from_density
 from visdom_plugin.nerf.rendering.volume_packed import _composite_torch, composite_packed, offsets_of
 
@@ -114,6 +115,61 @@ def test_dense_gradients_equal_finite_differences():
         return composite(weights_from_density(density, distances)[0], rgb, distances, background)
 
     assert torch.autograd.gradcheck(render, [x.requires_grad_() for x in (density, rgb, background)])
+
+
+def _dense(density, rgb, distances, background, weigh, compose):
+    """All that dense rays give, then gradients by everything but distances for random slopes of the results."""
+    inputs = [x.clone().requires_grad_() for x in (density, rgb, background)]
+    weights, transmittance = weigh(inputs[0], distances)
+    out = (*compose(weights, inputs[1], distances, inputs[2]), weights, transmittance)
+    draw = torch.Generator().manual_seed(1)
+    total = sum((x * torch.rand(x.shape, generator=draw).to(x)).sum() for x in out)
+    return [x.detach() for x in out] + list(torch.autograd.grad(total, inputs))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dense_kernels_equal_torch(dtype):
+    """With leading dimensions, one background and one set of edges for several rays, densities of 0 and beyond all
+    bounds, and intervals of no length."""
+    density, rgb, distances, background = _rays(12, 7)
+    density[::3, 2], density[1::3, 4], density[2::3, :] = 0, float("inf"), 0
+    distances[:, 5] = distances[:, 4]
+    cases = [(density.reshape(3, 4, 7), rgb.reshape(3, 4, 7, 3), distances.reshape(3, 4, 8), background[0])]
+    cases.append((density, rgb, distances[0], background))
+    for case in cases:
+        slow = _dense(*case, volume._weights_torch, volume._composite_torch)
+        fast = _dense(*(x.to(dtype) for x in case), weights_from_density, composite)
+        tolerance = {"rtol": 1e-9, "atol": 1e-12} if dtype == torch.float64 else {"rtol": 1e-4, "atol": 2e-6}
+        for a, b in zip(fast, slow, strict=True):
+            assert a.dtype == dtype
+            torch.testing.assert_close(a.double(), b, **tolerance)
+
+
+def test_gradients_by_the_distances_are_torchs():
+    density, _, distances, _ = _rays(3, 4)
+    assert torch.autograd.gradcheck(lambda t: weights_from_density(density, t), [distances.requires_grad_()])
+
+
+@pytest.mark.parametrize("rays,samples", [(0, 5), (3, 0)])
+def test_dense_rays_without_samples_and_no_rays(rays, samples):
+    density, rgb, distances, background = _rays(rays, samples, dtype=torch.float32)
+    weights, transmittance = weights_from_density(density, distances)
+    colour, alpha, depth = composite(weights, rgb, distances, background)
+    assert weights.shape == transmittance.shape == (rays, samples)
+    torch.testing.assert_close((colour, alpha, depth), (background, torch.zeros(rays), distances[:, -1]))
+
+
+def test_dense_is_the_same_bit_for_bit_on_one_thread_and_two():
+    case = _rays(400, 20, dtype=torch.float32)
+    results = []
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(_dense(*case, weights_from_density, composite))
+    finally:
+        torch.set_num_threads(before)
+    assert all(map(torch.equal, *results))
 
 
 @pytest.mark.parametrize("packed", PACKED)
