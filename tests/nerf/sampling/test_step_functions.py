@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from visdom_plugin.nerf.sampling import ray_warp
 from visdom_plugin.nerf.sampling import step_functions as steps
 
 SAMPLERS = {
@@ -167,6 +168,53 @@ def test_resampled_mass_is_the_blurred_functions_integral(half_width):
     torch.testing.assert_close(whole.sum(-1), weights.sum(-1))
 
 
+def _sample_distances_slowly(edges, weights, count, near, far, exponent, power, jitter):
+    new = steps._sample_torch(edges, weights**exponent, count, jitter)
+    return new, ray_warp.distances_of(new, near[..., None], far[..., None], power)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.7, 1.0])
+@pytest.mark.parametrize("power", [-1.5, 0.5, 1.0])
+def test_sampled_distances_equal_torch(exponent, power):
+    edges, weights = _histograms(60, 14)
+    edges = (edges - edges[:, :1]) / (edges[:, -1:] - edges[:, :1])
+    weights[::7] = 0
+    jitter = torch.rand(60, 1).double()
+    near, far = torch.rand(60).double(), 2 + torch.rand(60).double()
+    far[::5], far[1::5] = 1e6, near[1::5]  # all of space, and nothing
+    slow = _sample_distances_slowly(edges, weights, 20, near, far, exponent, power, jitter)
+    named = {"exponent": exponent, "power": power}
+    fast = steps.sample_distances(edges, weights, 20, near, far, jitter=jitter, **named)
+    torch.testing.assert_close(fast, slow, rtol=1e-7, atol=1e-9)
+    singles = [x.float() for x in (edges, weights, near, far, jitter)]
+    s, t = steps.sample_distances(*singles[:2], 20, *singles[2:4], jitter=singles[4], **named)
+    torch.testing.assert_close(s.double(), slow[0], rtol=0, atol=2e-6)
+    expected = ray_warp.distances_of(s.double(), near[:, None], far[:, None], power)
+    near_the_camera = expected < 100  # where one step of s is less than a step of what is told apart
+    torch.testing.assert_close(t.double()[near_the_camera], expected[near_the_camera], rtol=1e-5, atol=1e-6)
+    assert (t.diff(dim=-1) >= 0).all() and torch.isfinite(t).all()
+    assert (t >= singles[2][:, None]).all() and (t <= singles[3][:, None]).all()
+
+
+def test_the_first_level_samples_the_whole_interval():
+    near, far = torch.tensor([0.1, 2.0, 0.0]), torch.tensor([5.0, 2.5, float("inf")])
+    s, t = steps.sample_distances(torch.tensor([0.0, 1.0]), torch.ones(1), 8, near, far)
+    torch.testing.assert_close(s, torch.linspace(0, 1, 9).expand(3, -1))
+    torch.testing.assert_close((t[:, 0], t[:, -1]), (near, far))
+
+
+def test_sampling_is_the_same_bit_for_bit_on_one_thread_and_two():
+    edges, weights = _histograms(400, 20, dtype=torch.float32)
+    near, far, results, before = torch.rand(400), 2 + torch.rand(400), [], torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(steps.sample_distances(edges, weights, 30, near, far, exponent=0.3))
+    finally:
+        torch.set_num_threads(before)
+    assert all(map(torch.equal, *results))
+
+
 def test_nothing_carries_a_gradient():
     edges, weights = _histograms(3, 4)
     weights.requires_grad_()
@@ -174,6 +222,7 @@ def test_nothing_carries_a_gradient():
         steps.sample_edges(edges, weights, 4),
         steps.resample_blurred(edges, weights, 0.1, edges),
         steps.anneal(weights, 0.5),
+        *steps.sample_distances(edges, weights, 4, edges[:, 0], edges[:, -1]),
     ]
     assert not any(x.requires_grad for x in results)
 

@@ -37,8 +37,8 @@ from visdom_plugin.nerf.rendering.proposal_losses import antialiased_interlevel_
 from visdom_plugin.nerf.rendering.volume import composite, weights_from_density
 from visdom_plugin.nerf.sampling.contraction import contract
 from visdom_plugin.nerf.sampling.multisampling import multisample
-from visdom_plugin.nerf.sampling.ray_warp import curve_distances, distances_of
-from visdom_plugin.nerf.sampling.step_functions import anneal, sample_edges
+from visdom_plugin.nerf.sampling.ray_warp import curve_distances
+from visdom_plugin.nerf.sampling.step_functions import anneal_exponent, sample_distances
 from visdom_plugin.render import Render
 from visdom_plugin.seeding import draw_on, generator, uniform
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
@@ -242,14 +242,20 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
     ) -> tuple[Level, Tensor]:
         """One level, sampled where the level before saw something, and its network's outputs (n, S, ...)."""
         n = len(rays.near)
-        near, far = rays.near[:, None], rays.far[:, None]
         if before is None:
-            s, weights = near.new_tensor([0.0, 1.0]).expand(n, 2).contiguous(), torch.ones_like(near)
+            s, weights = rays.near.new_tensor([0.0, 1.0]), rays.near.new_ones(1)
         else:
             s, weights = before.s, before.weights.detach()
-        jitter = None if generator is None else uniform(generator, self.device, n, 1)
-        s = sample_edges(s, anneal(weights, progress, self.config.anneal_slope), count, jitter)
-        t = distances_of(s, near, far, self.config.spacing_power)
+        s, t = sample_distances(
+            s,
+            weights,
+            count,
+            rays.near,
+            rays.far,
+            exponent=anneal_exponent(progress, self.config.anneal_slope),
+            power=self.config.spacing_power,
+            jitter=None if generator is None else uniform(generator, self.device, n, 1),
+        )
         turn = None if generator is None else uniform(generator, self.device, n, count)
         points, std = multisample(rays.origins, rays.directions, t, radius, turn)
         density, out = density_of(self.model[name](points, std, squares), self.config.density_bias)

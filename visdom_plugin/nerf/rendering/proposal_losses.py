@@ -57,7 +57,7 @@ class _Interlevel(torch.autograd.Function):
     @staticmethod
     def forward(ctx, w_prop, t_nerf, w_nerf, t_prop, half_width, eps):
         arrays = (t_nerf, w_nerf, t_prop, w_prop)
-        out = step_kernels.run(step_kernels.interlevel, w_prop.shape[-1] + 1, arrays, half_width, eps)
+        (out,) = step_kernels.run(step_kernels.interlevel, [w_prop.shape[-1] + 1], arrays, half_width, eps)
         ctx.save_for_backward(out[..., :-1])
         return out[..., -1].clone()
 

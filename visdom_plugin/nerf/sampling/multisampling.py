@@ -19,6 +19,7 @@ RAYS_PER_PIECE = 32
 
 ANGLES = tuple(math.pi / 3 * k for k in (0, 2, 4, 3, 5, 1))
 STEPS = tuple(3 / math.sqrt(7) * (2 * j / 5 - 1) for j in range(6))
+UNIT = np.float32([[math.cos(a), math.sin(a)] for a in ANGLES])
 
 
 def axes_across(directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -82,23 +83,20 @@ def _multisample_torch(origins, directions, distances, radius, random, std_scale
 
 def _multisample_cpu(origins, directions, distances, radius, random, std_scale):
     lead, sections = distances.shape[:-1], distances.shape[-1] - 1
-    first, second = axes_across(directions.detach())
-    frame = torch.stack([first, second, directions.detach(), origins.detach()], -2).expand(*lead, 4, 3)
     count = radius.numel()
-    frame, distances, radius = (
-        x.detach().float().reshape(count, *shape).contiguous().numpy()
-        for x, shape in ((frame, (4, 3)), (distances, (-1,)), (radius, ()))
+    rays = tuple(
+        x.detach().float().expand(*lead, *shape).reshape(count, *shape).contiguous().numpy()
+        for x, shape in ((origins, (3,)), (directions, (3,)), (distances, (sections + 1,)), (radius, ()))
     )
-    points = np.empty((len(radius), sections, 6, 3), np.float32)
-    std = np.empty((len(radius), sections, 6), np.float32)
-    unit = np.float32([[math.cos(a), math.sin(a)] for a in ANGLES])
-    rays, shape = (frame, distances, radius), (unit, np.float32(STEPS), np.float32(std_scale))
+    points = np.empty((count, sections, 6, 3), np.float32)
+    std = np.empty((count, sections, 6), np.float32)
+    shape = UNIT, np.float32(STEPS), np.float32(std_scale)
     if random is None:
-        flat = points.reshape(len(radius), sections, 18)
-        parallel_for(_fixed_hexagons, len(radius), RAYS_PER_PIECE, *rays, *shape, flat, std)
+        flat = points.reshape(count, sections, 18)
+        parallel_for(_fixed_hexagons, count, RAYS_PER_PIECE, *rays, *shape, flat, std)
     else:
         turns = random.detach().float().expand(*lead, sections).reshape(count, sections).contiguous().numpy()
-        parallel_for(_hexagons, len(radius), RAYS_PER_PIECE, *rays, turns, *shape, points, std)
+        parallel_for(_hexagons, count, RAYS_PER_PIECE, *rays, turns, *shape, points, std)
     return torch.from_numpy(points).reshape(*lead, sections, 6, 3), torch.from_numpy(std).reshape(
         *lead, sections, 6
     )
@@ -116,11 +114,24 @@ def _place(t0, t1):
     return base, scale * math.sqrt(squared + real(4))
 
 
+@kernel(error_model="numpy", inline="always")
+def _axes_across(x, y, z):
+    """See `axes_across`."""
+    real = np.float32
+    sign = real(-1) if z < 0 else real(1)
+    a = -real(1) / (sign + z)
+    b = x * y * a
+    return (real(1) + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
 @kernel(error_model="numpy", counted=False)
-def _hexagons(begin, end, frame, distances, radius, random, unit, steps, std_scale, points, std):
+def _hexagons(
+    begin, end, origins, directions, distances, radius, random, unit, steps, std_scale, points, std
+):
     real = np.float32
     for ray in range(begin, end):
-        f = frame[ray]
+        origin, along = origins[ray], directions[ray]
+        first, second = _axes_across(along[0], along[1], along[2])
         wide = radius[ray] * real(math.sqrt(0.5))
         for section in range(distances.shape[1] - 1):
             base, scale = _place(distances[ray, section], distances[ray, section + 1])
@@ -135,11 +146,11 @@ def _hexagons(begin, end, frame, distances, radius, random, unit, steps, std_sca
                 x, y = across * (c * cos - s * sin), across * (c * sin + s * cos)
                 deviation[j] = std_scale * across
                 for axis in range(3):
-                    point[j, axis] = x * f[0, axis] + y * f[1, axis] + t * f[2, axis] + f[3, axis]
+                    point[j, axis] = x * first[axis] + y * second[axis] + t * along[axis] + origin[axis]
 
 
 @kernel(error_model="numpy")
-def _fixed_hexagons(begin, end, frame, distances, radius, unit, steps, std_scale, points, std):
+def _fixed_hexagons(begin, end, origins, directions, distances, radius, unit, steps, std_scale, points, std):
     """Without random turns: the points of a ray lie on twelve lines, of which every section takes six."""
     real = np.float32
     turn = real(math.pi / 6)
@@ -148,15 +159,16 @@ def _fixed_hexagons(begin, end, frame, distances, radius, unit, steps, std_scale
     for k in range(18):
         along[k] = steps[k // 3]
     for ray in range(begin, end):
-        f = frame[ray]
+        d = directions[ray]
+        first, second = _axes_across(d[0], d[1], d[2])
         wide = radius[ray] * real(math.sqrt(0.5))
         for k in range(18):
             j, axis = k // 3, k % 3
             c, s = unit[j, 0], unit[j, 1]
-            origin[k] = f[3, axis]
-            lines[0, k] = wide * (c * f[0, axis] + s * f[1, axis]) + f[2, axis]
+            origin[k] = origins[ray, axis]
+            lines[0, k] = wide * (c * first[axis] + s * second[axis]) + d[axis]
             c, s = c * cos + s * sin, c * sin - s * cos
-            lines[1, k] = wide * (c * f[0, axis] + s * f[1, axis]) + f[2, axis]
+            lines[1, k] = wide * (c * first[axis] + s * second[axis]) + d[axis]
         for section in range(distances.shape[1] - 1):
             base, scale = _place(distances[ray, section], distances[ray, section + 1])
             line = section % 2

@@ -29,19 +29,17 @@ def distances_of(
     """
     if power == 1:
         return near * (1 - s) + far * s
-    rung = _rung(power, premultiplier)
-    between = rung(near) * (1 - s) + rung(far) * s
-    t = (between ** (1 / power) - 1) * (abs(power - 1) / premultiplier)
+    factor = factor_of(power, premultiplier)
+    between = (near * factor + 1) ** power * (1 - s) + (far * factor + 1) ** power * s
+    t = (between ** (1 / power) - 1) / factor
     return t.maximum(near).minimum(far)
+
+
+def factor_of(power: float, premultiplier: float = PREMULTIPLIER) -> float:
+    """What `distances_of` multiplies distances by; 1 where the power is."""
+    return 1.0 if power == 1 else premultiplier / abs(power - 1)
 
 
 def curve_distances(t: Tensor) -> Tensor:
     """Distances (...) >= 0 as Zip-NeRF's distortion loss measures them (p = -0.25, times 10,000)."""
     return power_ladder(t, CURVE_POWER, CURVE_PREMULTIPLIER)
-
-
-def _rung(power: float, premultiplier: float):
-    if power == 1:
-        return lambda t: t
-    factor = premultiplier / abs(power - 1)
-    return lambda t: (t * factor + 1) ** power

@@ -6,10 +6,11 @@ The maths of mip-NeRF 360 (resampling, annealing) and Zip-NeRF (blurring).
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from visdom_plugin.nerf.sampling import step_kernels
+from visdom_plugin.nerf.sampling import ray_warp, step_kernels
 from visdom_plugin.nerf.sampling.step_kernels import LEAST_WEIGHT
 
 
@@ -31,16 +32,66 @@ def sample_edges(edges: Tensor, weights: Tensor, count: int, jitter: Tensor | No
     Returns:
         (..., count + 1) ascending, within the old edges.
     """
-    if count < 2:
-        raise ValueError(f"sample_edges makes at least 2 intervals, not {count}")
-    if jitter is None:
-        jitter = edges.new_full((1,), 0.5)
     if edges.device.type == "cpu":
-        return step_kernels.run(step_kernels.sample, count + 1, (edges, weights, jitter))
+        return _sample_cpu(edges, weights, count, jitter)[0]
     return _sample_torch(edges, weights, count, jitter)
 
 
-def _sample_torch(edges: Tensor, weights: Tensor, count: int, jitter: Tensor) -> Tensor:
+@torch.no_grad()
+def sample_distances(
+    edges: Tensor,
+    weights: Tensor,
+    count: int,
+    near: Tensor,
+    far: Tensor,
+    *,
+    exponent: float = 1.0,
+    power: float = ray_warp.POWER,
+    jitter: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """`sample_edges` of normalised distances by weights^exponent, and where the new edges lie along the ray.
+
+    Args:
+        near, far: (...) bounds of the ray.
+        power: of the ladder between them, see `ray_warp.distances_of`.
+
+    Returns:
+        New edges (..., count + 1) in [0, 1], and their distances (..., count + 1) in [near, far].
+    """
+    near, far = near[..., None], far[..., None]
+    if edges.device.type == "cpu":
+        edges, distances = _sample_cpu(edges, weights, count, jitter, (near, far), exponent, power)
+        return edges, distances
+    edges = _sample_torch(edges, weights**exponent, count, jitter)
+    return edges, ray_warp.distances_of(edges, near, far, power)
+
+
+def _sample_cpu(
+    edges: Tensor,
+    weights: Tensor,
+    count: int,
+    jitter: Tensor | None,
+    bounds: tuple[Tensor, Tensor] | None = None,
+    exponent: float = 1.0,
+    power: float = 1.0,
+) -> list[Tensor]:
+    """New edges and, in the second place, their distances between the bounds (..., 1); nothing there without."""
+    jitter = _jitter_of(edges, count, jitter)
+    near, far = bounds or (jitter[..., :1], jitter[..., :1])
+    columns = count + 1, count + 1 if bounds else 0
+    real = np.float32 if edges.dtype == torch.float32 else np.float64
+    scalars = real(exponent), power, real(1 / power), ray_warp.factor_of(power)
+    return step_kernels.run(step_kernels.sample, columns, (edges, weights, jitter, near, far), *scalars)
+
+
+def _jitter_of(edges: Tensor, count: int, jitter: Tensor | None) -> Tensor:
+    if count < 2:
+        raise ValueError(f"sample_edges makes at least 2 intervals, not {count}")
+    return edges.new_full((1,), 0.5) if jitter is None else jitter
+
+
+def _sample_torch(edges: Tensor, weights: Tensor, count: int, jitter: Tensor | None) -> Tensor:
+    jitter = _jitter_of(edges, count, jitter)
     edges = edges.expand(*weights.shape[:-1], -1)
     mass = weights.clamp_min(LEAST_WEIGHT).cumsum(-1)
     mass = torch.nn.functional.pad(mass / mass[..., -1:], (1, 0))
@@ -64,7 +115,12 @@ def _interpolate(x: Tensor, y: Tensor, at: Tensor) -> Tensor:
 @torch.no_grad()
 def anneal(weights: Tensor, progress: float, slope: float = 10.0) -> Tensor:
     """weights^b with b from 0 to 1 as progress does (Schlick's bias; mip-NeRF 360, eq. 18): flat at the start."""
-    return weights ** (slope * progress / ((slope - 1) * progress + 1))
+    return weights ** anneal_exponent(progress, slope)
+
+
+def anneal_exponent(progress: float, slope: float = 10.0) -> float:
+    """Of `anneal`."""
+    return slope * progress / ((slope - 1) * progress + 1)
 
 
 @torch.no_grad()
@@ -85,7 +141,7 @@ def resample_blurred(edges: Tensor, weights: Tensor, half_width: float, at: Tens
     """
     if edges.device.type == "cpu":
         arrays = (edges, weights, at)
-        return step_kernels.run(step_kernels.resample_blurred, at.shape[-1] - 1, arrays, half_width)
+        return step_kernels.run(step_kernels.resample_blurred, [at.shape[-1] - 1], arrays, half_width)[0]
     return _resample_blurred_torch(edges, weights, half_width, at).to(weights)
 
 

@@ -5,6 +5,9 @@ Arrays are (rays, ...) in one floating dtype; sums are kept in float64.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -16,18 +19,18 @@ RAYS_PER_PIECE = 128
 LEAST_WEIGHT = 1e-12  # so that a ray that meets nothing is sampled evenly over its intervals
 
 
-def run(kernel, columns: int, arrays: tuple[Tensor, ...], *scalars: float) -> Tensor:
+def run(kernel, columns: Sequence[int], arrays: Sequence[Tensor], *scalars: float) -> list[Tensor]:
     """Runs a kernel over rays.
 
     Args:
-        kernel: called with begin, end, the arrays, the scalars and the output.
-        columns: C of the result.
+        kernel: called with begin, end, the arrays, the scalars and the outputs.
+        columns: C of each result.
         arrays: (..., C_k) tensors on the CPU, whose leading dimensions broadcast. The first gives the dtype.
 
     Returns:
-        (..., C).
+        (..., C) for each result.
     """
-    lead = torch.broadcast_shapes(*(x.shape[:-1] for x in arrays))
+    lead = np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
     flat = [
         x.detach()
         .to(arrays[0].dtype)
@@ -37,29 +40,36 @@ def run(kernel, columns: int, arrays: tuple[Tensor, ...], *scalars: float) -> Te
         .numpy()
         for x in arrays
     ]
-    out = np.empty((len(flat[0]), columns), flat[0].dtype)
-    parallel_for(kernel, len(out), RAYS_PER_PIECE, *flat, *scalars, out)
-    return torch.from_numpy(out).reshape(*lead, columns)
+    out = [np.empty((len(flat[0]), c), flat[0].dtype) for c in columns]
+    parallel_for(kernel, len(flat[0]), RAYS_PER_PIECE, *flat, *scalars, *out)
+    return [torch.from_numpy(x).reshape(*lead, x.shape[1]) for x in out]
 
 
 @kernel(error_model="numpy")
-def sample(begin, end, edges, weights, jitter, out):
-    count = out.shape[1] - 1
+def sample(begin, end, edges, weights, jitter, near, far, exponent, power, inverse, factor, out, distances):
+    """New edges by the weights to the power `exponent`, and, if asked for, where they lie between near and far
+    (rays, 1): see `ray_warp.distances_of`, with `inverse` of the power, and `factor` as there.
+
+    `exponent` and `inverse` are of the arrays' type, since it takes twice as long to find a power in float64.
+    """
+    count, warped = out.shape[1] - 1, distances.shape[1] > 0
     last = weights.shape[1] - 1
     step = 1 if jitter.shape[1] > 1 else 0
+    masses = np.empty(last + 1)
     for ray in range(begin, end):
         total = 0.0
         for i in range(last + 1):
-            total += max(np.float64(weights[ray, i]), LEAST_WEIGHT)
-        i, below, mass = 0, 0.0, max(np.float64(weights[ray, 0]), LEAST_WEIGHT)
+            weight = weights[ray, i] if exponent == 1 else math.pow(weights[ray, i], exponent)
+            masses[i] = max(np.float64(weight), LEAST_WEIGHT)
+            total += masses[i]
+        i, below = 0, 0.0
         first, point = 0.0, 0.0
         for k in range(count):
             u = (k + np.float64(jitter[ray, k * step])) / count * total
-            while i < last and below + mass <= u:
-                below += mass
+            while i < last and below + masses[i] <= u:
+                below += masses[i]
                 i += 1
-                mass = max(np.float64(weights[ray, i]), LEAST_WEIGHT)
-            share = min((u - below) / mass, 1.0)
+            share = min((u - below) / masses[i], 1.0)
             previous, point = point, edges[ray, i] + share * (np.float64(edges[ray, i + 1]) - edges[ray, i])
             if k == 0:
                 first = point
@@ -67,6 +77,16 @@ def sample(begin, end, edges, weights, jitter, out):
                 out[ray, k] = 0.5 * (previous + point)
         out[ray, 0] = max(2 * first - out[ray, 1], edges[ray, 0])
         out[ray, count] = min(2 * point - out[ray, count - 1], edges[ray, last + 1])
+        if warped:
+            low, high = np.float64(near[ray, 0]), np.float64(far[ray, 0])
+            if power != 1:
+                low, high = (low * factor + 1) ** power, (high * factor + 1) ** power
+            for k in range(count + 1):
+                s = np.float64(out[ray, k])
+                distances[ray, k] = low * (1 - s) + high * s
+                if power != 1:
+                    t = (math.pow(distances[ray, k], inverse) - 1.0) / factor
+                    distances[ray, k] = min(max(t, near[ray, 0]), far[ray, 0])
 
 
 @kernel(error_model="numpy")
