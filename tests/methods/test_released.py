@@ -135,7 +135,7 @@ def test_samples_may_be_evenly_spaced(scene, hull):  # noqa: F811
     )
     bounded = even.bound(*rays, [])
     squares = even._mean_squares()[0]
-    level, _ = even._look("coarse", bounded, torch.full((5,), 0.001), None, 12, 1.0, None, squares)
+    level, _, _ = even._look("coarse", bounded, torch.full((5,), 0.001), None, 12, 1.0, None, squares)
     expected = bounded.near[:, None] + level.s * (bounded.far - bounded.near)[:, None]
     torch.testing.assert_close(level.t, expected)
     assert HULL.bounds_scale == 1.0

@@ -18,6 +18,7 @@ from visdom_plugin.nerf.encoding.hash_grid import (
     default_backend,
     encode,
     encode_mean,
+    encode_spread,
     initial_table,
     mean_square_per_level,
 )
@@ -208,18 +209,36 @@ def test_initial_table_and_mean_squares():
 
 
 @pytest.mark.parametrize("large", [False, True])
-def test_mean_squares_and_their_gradient_agree_with_torch(large, monkeypatch):
+def test_mean_squares_agree_with_torch(large, monkeypatch):
     monkeypatch.setattr(hash_cpu, "LARGE", 0 if large else 1 << 40)
     layout = HashLayout(levels=3, features=3, base_resolution=3, max_resolution=40, log2_table_size=13)
     table = initial_table(layout, torch.Generator().manual_seed(0), 0.5)
-    results = []
-    for values in (table, table.double()):  # float64 takes plain torch
-        values.requires_grad_()
-        squares = mean_square_per_level(values, layout)
-        (gradient,) = torch.autograd.grad((squares * torch.tensor([1.0, -2, 3])).sum(), values)
-        results.append((squares.double(), gradient.double()))
-    for fast, slow in zip(*results, strict=True):
-        torch.testing.assert_close(fast, slow, rtol=1e-6, atol=1e-12)
+    slow = mean_square_per_level(table.double(), layout)  # float64 takes plain torch
+    fast = mean_square_per_level(table, layout)
+    torch.testing.assert_close(fast.double(), slow, rtol=1e-6, atol=1e-12)
+    assert mean_square_per_level(table.requires_grad_(), layout).requires_grad
+
+
+@pytest.mark.parametrize("used", ["features", "squares", "both"])
+def test_spread_encoding_equals_its_parts(used):
+    """Features, what levels leave out, and mean squares, with the gradient of the first and the last."""
+    table = table_of(SMALL)
+    points, scales = drawn(2, 20, 6, 3), drawn(3, 20, 6, high=0.3) ** 2
+    squares = mean_square_per_level(table.detach(), SMALL)
+    fast = encode_spread(points, scales, table, SMALL, squares, 0.1)
+    features, weights = encode_mean(points, scales, table, SMALL, "torch")
+    left_out = (2 * weights - 1) * (0.1**2 + squares).sqrt()
+    slow = features, left_out, mean_square_per_level(table, SMALL)
+    torch.testing.assert_close(fast, slow, rtol=1e-5, atol=2e-6)
+    assert not fast[1].requires_grad
+    g = (
+        torch.randn(features.shape, generator=torch.Generator().manual_seed(4)),
+        torch.tensor([1.0, -2, 3, 40]),
+    )
+    chosen = {"features": [0], "squares": [2], "both": [0, 2]}[used]
+    totals = [sum((out[i] * g[i // 2]).sum() for i in chosen) for out in (fast, slow)]
+    gradients = [torch.autograd.grad(total, table)[0] for total in totals]
+    torch.testing.assert_close(*gradients, rtol=1e-5, atol=2e-5)
 
 
 def test_mismatches_are_told():

@@ -86,13 +86,28 @@ def test_distortion_scales_and_vanishes():
     )
 
 
-@pytest.mark.parametrize("name", ["antialiased", "distortion"])
+def test_distortion_is_the_same_on_other_devices_and_on_any_number_of_threads():
+    t, w = _histograms(400, 20)
+    slow = proposal_losses._Distortion.apply(t, w)
+    torch.testing.assert_close(proposal_losses.distortion_loss(t, w), slow)
+    results, before = [], torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(proposal_losses.distortion_loss(t.float(), w.float()))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*results)
+
+
+@pytest.mark.parametrize("name", ["antialiased", "distortion", "distortion elsewhere"])
 def test_gradients_equal_finite_differences(name):
     t, w = _histograms(5, 6)
     t_prop, w_prop = _histograms(5, 7, seed=1)
     loss = {
         "antialiased": lambda x: proposal_losses.antialiased_interlevel_loss(t, w, t_prop, x, 0.02, eps=1e-2),
         "distortion": lambda x: proposal_losses.distortion_loss(t_prop, x),
+        "distortion elsewhere": lambda x: proposal_losses._Distortion.apply(t_prop, x),
     }[name]
     assert torch.autograd.gradcheck(loss, [w_prop.requires_grad_()])
 

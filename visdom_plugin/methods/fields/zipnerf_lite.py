@@ -26,7 +26,7 @@ from visdom_plugin.methods.fields.radiance_field import RadianceField
 from visdom_plugin.nerf.activations import density_of, padded_sigmoid
 from visdom_plugin.nerf.encoding.hash_grid import (
     HashLayout,
-    encode_mean,
+    encode_spread,
     initial_table,
     mean_square_per_level,
 )
@@ -61,19 +61,22 @@ class AntialiasedGrid(nn.Module):
         # Features, and for each level how much of it the sample is too large for.
         self.net = perceptron([layout.width + layout.levels, hidden, outputs], generator)
 
-    def forward(self, points: Tensor, std: Tensor, mean_squares: Tensor | None = None) -> Tensor:
-        """(..., S, 3) points in the local frame and (..., S) standard deviations to (..., outputs).
-
-        `mean_squares` saves looking through the table for them.
+    def forward(
+        self, points: Tensor, std: Tensor, mean_squares: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """(..., S, 3) points in the local frame and (..., S) standard deviations to (..., outputs), and the mean
+        squares (levels,) with their gradient. `mean_squares` saves looking through the table for them.
         """
         unit, std = contract(points, std, scale=0.25, shift=0.5)
-        features, weights = encode_mean(unit, std, self.table, self.layout)
         squares = self.mean_squares() if mean_squares is None else mean_squares
-        return self.net(features, (2 * weights - 1) * (INITIAL_FEATURE**2 + squares.detach()).sqrt())
+        features, left_out, squares = encode_spread(
+            unit, std, self.table, self.layout, squares, INITIAL_FEATURE
+        )
+        return self.net(features, left_out), squares
 
     def mean_squares(self) -> Tensor:
-        """(levels,) of the table's features."""
-        return mean_square_per_level(self.table, self.layout)
+        """(levels,) of the table's features, without gradient."""
+        return mean_square_per_level(self.table.detach(), self.layout)
 
 
 class ColourNet(nn.Module):
@@ -139,8 +142,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         draw = draw_on(self.device, generator(self.seed, "step", step))
         background = self.draw_background(len(batch.mask), draw)
         rays = self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
-        squares = self._mean_squares()
-        levels, out = self._see(rays, batch.radii, c.samples, step, draw, squares)
+        levels, out, squares = self._see(rays, batch.radii, c.samples, step, draw)
         colours = self._shade(out, rays.directions[:, None])
         last = levels[-1]
         rgb, alpha, _ = composite(last.weights, colours, last.t, background)
@@ -171,7 +173,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
     def silhouette_of_nothing(
         self, rays: LocalRays, radius: Tensor, step: int, generator: Generator
     ) -> Tensor:
-        levels, _ = self._see(rays, radius, self.config.samples, step, generator, self._mean_squares())
+        levels, _, _ = self._see(rays, radius, self.config.samples, step, generator)
         return self._silhouette_loss(levels, levels[-1].weights.sum(-1), torch.zeros_like(radius))
 
     def _silhouette_loss(
@@ -219,15 +221,16 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         counts: Sequence[int],
         step: int,
         generator: Generator,
-        squares: Sequence[Tensor],
-    ) -> tuple[list[Level], Tensor]:
-        """All levels along rays in a training step, and the field's outputs (n, S, ...), as `_look` has them."""
+    ) -> tuple[list[Level], Tensor, list[Tensor]]:
+        """All levels along rays in a training step, the field's outputs (n, S, ...), and the mean squares of the
+        levels' tables, as `_look` has them."""
         level, progress = None, step / max(self.config.steps, 1)
-        levels = []
-        for name, count, of_table in zip(LEVELS, counts, squares, strict=True):
-            level, out = self._look(name, rays, radius, level, count, progress, generator, of_table)
+        levels, squares = [], []
+        for name, count, known in zip(LEVELS, counts, self._mean_squares(), strict=True):
+            level, out, of_table = self._look(name, rays, radius, level, count, progress, generator, known)
             levels.append(level)
-        return levels, out
+            squares.append(of_table)
+        return levels, out, squares
 
     def _look(
         self,
@@ -239,8 +242,9 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         progress: float,
         generator: Generator | None,
         squares: Tensor,
-    ) -> tuple[Level, Tensor]:
-        """One level, sampled where the level before saw something, and its network's outputs (n, S, ...)."""
+    ) -> tuple[Level, Tensor, Tensor]:
+        """One level, sampled where the level before saw something, its network's outputs (n, S, ...), and its mean
+        squares with their gradient."""
         n = len(rays.near)
         if before is None:
             s, weights = rays.near.new_tensor([0.0, 1.0]), rays.near.new_ones(1)
@@ -258,8 +262,9 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         )
         turn = None if generator is None else uniform(generator, self.device, n, count)
         points, std = multisample(rays.origins, rays.directions, t, radius, turn)
-        density, out = density_of(self.model[name](points, std, squares), self.config.density_bias)
-        return Level(s, t, weights_from_density(density, t)[0]), out
+        out, squares = self.model[name](points, std, squares)
+        density, out = density_of(out, self.config.density_bias)
+        return Level(s, t, weights_from_density(density, t)[0]), out, squares
 
     @torch.no_grad()
     def render(self, camera: Cameras, background: Tensor) -> Render:
@@ -283,7 +288,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         for name, count, squares in zip(LEVELS, counts, self._squares or self._mean_squares(), strict=True):
             if not len(left):
                 return rgb, alpha, depth
-            level, out = self._look(name, rays, radius, level, count, 1.0, None, squares)
+            level, out, _ = self._look(name, rays, radius, level, count, 1.0, None, squares)
             # Proposals bound the field's weights from above: where they see nothing, it does not either.
             seen = (level.weights.sum(-1) > INVISIBLE).nonzero()[:, 0]
             left, out, level = left[seen], out[seen], Level(*(x[seen] for x in level))
@@ -305,7 +310,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         points = points.to(self.device)[:, None]
         # As one voxel of the finest level would be seen.
         std = torch.full_like(points[..., 0], 0.5 / self.config.grid.max_resolution)
-        return self.model["field"](points, std)
+        return self.model["field"](points, std)[0]
 
     def density(self, points: Tensor) -> Tensor:
         return density_of(self._field(points), self.config.density_bias)[0]

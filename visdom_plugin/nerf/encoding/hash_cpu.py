@@ -25,9 +25,21 @@ SUMMED = 1024
 """Squares summed in float32 at a time."""
 
 
-def encode_cpu(points: Tensor, scales: Tensor | None, table: Tensor, layout: HashLayout):
-    """(groups, S, 3), (groups, S) or None -> (groups, levels * features), (groups, levels) or an empty tensor."""
-    return _Encode.apply(table, points, scales, layout)
+def encode_cpu(
+    points: Tensor,
+    scales: Tensor | None,
+    table: Tensor,
+    layout: HashLayout,
+    spans: Tensor | None = None,
+    squares: Tensor | None = None,
+):
+    """(groups, S, 3), (groups, S) or None -> (groups, levels * features), (groups, levels) or an empty tensor.
+
+    With spans (levels,) the second is times them, as the kernel says. With the mean squares (levels,) of the table
+    they come out third, with a gradient.
+    """
+    out = _Encode.apply(table, points, scales, layout, spans, squares)
+    return out if squares is not None else out[:2]
 
 
 @cache
@@ -50,10 +62,11 @@ def _flat(tensor: Tensor | None) -> np.ndarray:
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, table, points, scales, layout):
+    def forward(ctx, table, points, scales, layout, spans, squares):
+        ctx.set_materialize_grads(False)
         groups, samples = points.shape[:-1]
         ctx.layout, ctx.samples = layout, samples
-        ctx.save_for_backward(points, scales)
+        ctx.save_for_backward(points, scales, None if squares is None else table)
         out = torch.empty(groups, layout.width)
         mean_strengths = torch.empty(groups if scales is not None else 0, layout.levels)
         if samples > hash_kernels.BLOCK:
@@ -62,53 +75,44 @@ class _Encode(torch.autograd.Function):
         parallel_for(
             hash_kernels.encode, layout.levels * blocks, max(blocks // PIECES_PER_LEVEL, 1), samples,
             _flat(points), _flat(scales), _flat(table), layout.features, *_describe(layout),
-            _flat(out), _flat(mean_strengths),
+            _flat(spans), _flat(out), _flat(mean_strengths),
         )  # fmt: skip
         ctx.mark_non_differentiable(mean_strengths)
-        return out, mean_strengths
+        return out, mean_strengths, None if squares is None else squares.clone()
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, g_out, _):
-        points, scales = ctx.saved_tensors
+    def backward(ctx, g_out, _, g_squares):
+        points, scales, table = ctx.saved_tensors
         layout, samples = ctx.layout, ctx.samples
         g_table = torch.empty(layout.rows, layout.features)
+        if g_out is None:
+            g_out = torch.zeros(len(points), layout.width)
+        decay = None if g_squares is None else g_squares * _share_of_each(layout)
         parallel_for(
             hash_kernels.encode_backward, layout.levels, 1, samples, _flat(points), _flat(scales),
-            _flat(g_out), layout.features, *_describe(layout), _flat(g_table),
+            _flat(g_out), layout.features, *_describe(layout), _flat(table), _flat(decay), _flat(g_table),
         )  # fmt: skip
-        return g_table, None, None, None
+        return g_table, None, None, None, None, None
 
 
-class MeanSquares(torch.autograd.Function):
-    """(levels,) means of the squared features of each level of a table, and their gradient, level by level."""
+@cache
+def _share_of_each(layout: HashLayout) -> Tensor:
+    """(levels,) slope of a mean square by a feature of the level, over the feature."""
+    return 2 / (torch.tensor(layout.sizes, dtype=torch.float32) * layout.features)
 
-    @staticmethod
-    def forward(ctx, table, sizes):
-        ctx.save_for_backward(table)
-        ctx.sizes = sizes
-        levels, out = [rows.detach().numpy() for rows in table.split(sizes)], torch.empty(len(sizes))
 
-        def find(begin: int, end: int) -> None:
-            for level in range(begin, end):
-                out[level] = _mean_square(levels[level].reshape(-1))
+def mean_squares(table: Tensor, layout: HashLayout) -> Tensor:
+    """(levels,) means of the squared features of each level of a table, without gradient."""
+    levels = [rows.detach().numpy() for rows in table.split(layout.sizes)]
+    out = torch.empty(len(levels))
 
-        parallel_for(find, len(sizes), _grain(table, sizes))
-        return out
+    def find(begin: int, end: int) -> None:
+        for level in range(begin, end):
+            out[level] = _mean_square(levels[level].reshape(-1))
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, g):
-        (table,) = ctx.saved_tensors
-        out = torch.empty_like(table)
-        pairs = list(zip(*(x.detach().split(ctx.sizes) for x in (table, out)), g.tolist(), strict=True))
-
-        def scale(begin: int, end: int) -> None:
-            for rows, to, factor in pairs[begin:end]:
-                np.multiply(rows.numpy(), np.float32(2 * factor / rows.numel()), out=to.numpy())
-
-        parallel_for(scale, len(pairs), _grain(table, ctx.sizes))
-        return out, None
+    parallel_for(find, len(levels), _grain(table, layout.sizes))
+    return out
 
 
 def _grain(table: Tensor, sizes: tuple[int, ...]) -> int:

@@ -18,7 +18,15 @@ from torch import Tensor
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 
-__all__ = ["HashLayout", "encode", "encode_mean", "initial_table", "mean_square_per_level", "warm_up"]
+__all__ = [
+    "HashLayout",
+    "encode",
+    "encode_mean",
+    "encode_spread",
+    "initial_table",
+    "mean_square_per_level",
+    "warm_up",
+]
 
 
 def encode(points: Tensor, table: Tensor, layout: HashLayout, backend: str | None = None) -> Tensor:
@@ -58,6 +66,27 @@ def encode_mean(
     return _encode(points, scales, table, layout, backend)
 
 
+def encode_spread(
+    points: Tensor, scales: Tensor, table: Tensor, layout: HashLayout, squares: Tensor, initial: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`encode_mean` as Zip-NeRF's networks see it, by default backends.
+
+    Args:
+        squares: (levels,) `mean_square_per_level` of the table as it is, without gradient.
+        initial: largest feature of the table that training began with.
+
+    Returns:
+        features (..., layout.width); what the levels have left out, (..., levels): (2 w - 1) times the size of a
+        level's features, sqrt(initial^2 + square), with w the mean weights, without gradient; and the squares
+        once more, with a gradient, which is found in one go with the features'.
+    """
+    spans = (initial**2 + squares).sqrt()
+    if default_backend(table.device) == "cpu":
+        return _encode(points, scales, table, layout, "cpu", spans, squares)
+    features, weights = encode_mean(points, scales, table, layout)
+    return features, (2 * weights - 1) * spans, mean_square_per_level(table, layout)
+
+
 def initial_table(layout: HashLayout, generator: torch.Generator, scale: float = 1e-4) -> Tensor:
     """(layout.rows, layout.features) uniform in [-scale, scale], on the generator's device."""
     noise = torch.rand(layout.rows, layout.features, generator=generator, device=generator.device)
@@ -66,10 +95,11 @@ def initial_table(layout: HashLayout, generator: torch.Generator, scale: float =
 
 def mean_square_per_level(table: Tensor, layout: HashLayout) -> Tensor:
     """(levels,) mean of the squared features of each level; Zip-NeRF's hash decay is a multiple of their sum."""
-    if table.device.type == "cpu" and table.dtype == torch.float32:
-        from visdom_plugin.nerf.encoding.hash_cpu import MeanSquares
+    constant = not (torch.is_grad_enabled() and table.requires_grad)
+    if constant and table.device.type == "cpu" and table.dtype == torch.float32:
+        from visdom_plugin.nerf.encoding.hash_cpu import mean_squares
 
-        return MeanSquares.apply(table, layout.sizes)
+        return mean_squares(table, layout)
     return torch.stack([rows.square().mean() for rows in table.split(layout.sizes)])
 
 
@@ -82,8 +112,15 @@ def warm_up(layout: HashLayout, device: torch.device | str = "cpu") -> None:
     ).backward()
 
 
-def _encode(points: Tensor, scales: Tensor | None, table: Tensor, layout: HashLayout, backend: str | None):
-    """(..., S, 3), (..., S) or None -> (..., width), (..., levels) or None."""
+def _encode(
+    points: Tensor,
+    scales: Tensor | None,
+    table: Tensor,
+    layout: HashLayout,
+    backend: str | None,
+    *more: Tensor,
+):
+    """(..., S, 3), (..., S) or None -> (..., width), (..., levels) or None, and what else the backend returns."""
     if table.shape != (layout.rows, layout.features):
         raise ValueError(
             f"a table of shape {tuple(table.shape)}, a layout of {(layout.rows, layout.features)}"
@@ -95,10 +132,10 @@ def _encode(points: Tensor, scales: Tensor | None, table: Tensor, layout: HashLa
     points = points.detach().to(table.dtype).reshape(-1, samples, 3)
     if scales is not None:
         scales = scales.detach().to(table.dtype).reshape(-1, samples)
-    features, weights = run(points, scales, table, layout)
+    features, weights, *rest = run(points, scales, table, layout, *more)
     if scales is not None:
         weights = weights.reshape(*leading, layout.levels)
-    return features.reshape(*leading, layout.width), weights
+    return features.reshape(*leading, layout.width), weights, *rest
 
 
 def _encode_by_torch(points, scales, table, layout):
@@ -107,10 +144,10 @@ def _encode_by_torch(points, scales, table, layout):
     return encode_torch(points, scales, table, layout)
 
 
-def _encode_by_cpu(points, scales, table, layout):
+def _encode_by_cpu(points, scales, table, layout, *more):
     from visdom_plugin.nerf.encoding.hash_cpu import encode_cpu
 
-    return encode_cpu(points, scales, table, layout)
+    return encode_cpu(points, scales, table, layout, *more)
 
 
 def _encode_by_triton(points, scales, table, layout):

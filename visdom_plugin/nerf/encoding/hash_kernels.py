@@ -221,11 +221,12 @@ def _scatter(g_table, lanes, features, rows, weights, samples, groups, g_out, at
 @kernel(error_model="numpy")
 def encode(
     begin, end, samples, points, scales, table, features,
-    resolutions, dense, masks, offsets, out, mean_strengths,
+    resolutions, dense, masks, offsets, spans, out, mean_strengths,
 ):  # fmt: skip
     """Encodes items begin .. end - 1: item = level * blocks + block, so that neighbours share a level's table.
 
-    Writes out (groups, levels, features) and, if there are scales, mean_strengths (groups, levels).
+    Writes out (groups, levels, features) and, if there are scales, mean_strengths (groups, levels): numbers w in
+    [0, 1], or, with spans (levels,), (2 w - 1) times the level's.
     """
     levels = len(resolutions)
     groups = len(points) // (3 * samples)
@@ -245,7 +246,10 @@ def encode(
                 for p in range(g * samples, (g + 1) * samples):
                     total += strengths[p]
                     strengths[p] *= share
-                mean_strengths[(first + g) * levels + level] = total / np.float32(samples)
+                mean = total / np.float32(samples)
+                if len(spans):
+                    mean = (np.float32(2) * mean - np.float32(1)) * spans[level]
+                mean_strengths[(first + g) * levels + level] = mean
         _locate_level(
             points, first * samples, count * samples, resolutions[level], dense[level], masks[level],
             offsets[level], strengths, rows, weights,
@@ -264,9 +268,10 @@ def encode(
 @kernel(error_model="numpy")
 def encode_backward(
     begin, end, samples, points, scales, g_out, features,
-    resolutions, dense, masks, offsets, g_table,
+    resolutions, dense, masks, offsets, table, decay, g_table,
 ):  # fmt: skip
-    """Writes the table's gradient of `end - begin` levels, the finest first: item 0 is the last level."""
+    """Writes the table's gradient of `end - begin` levels, the finest first: item 0 is the last level. With decay
+    (levels,) the level's number times the table is added."""
     levels = len(resolutions)
     groups = len(points) // (3 * samples)
     groups_per_block = BLOCK // samples
@@ -296,3 +301,6 @@ def encode_backward(
                 _scatter(g_table, (0, 0, 0, 0), 4, rows, weights, samples, count, g_out, at, stride)
             else:
                 _scatter(g_table, (0,), features, rows, weights, samples, count, g_out, at, stride)
+        if len(decay):
+            for i in range(offsets[level] * features, offsets[level + 1] * features):
+                g_table[i] += decay[level] * table[i]

@@ -29,7 +29,8 @@ def antialiased_interlevel_loss(
         by P.
     """
     if w_prop.device.type == "cpu":
-        return _Interlevel.apply(w_prop, t_nerf.detach(), w_nerf.detach(), t_prop.detach(), half_width, eps)
+        arrays = t_nerf, w_nerf, t_prop
+        return _Sloped.apply(w_prop, step_kernels.interlevel, arrays, half_width, eps)
     return _antialiased_torch(t_nerf, w_nerf, t_prop, w_prop, half_width, eps)
 
 
@@ -48,16 +49,17 @@ def distortion_loss(t: Tensor, w: Tensor) -> Tensor:
     Returns:
         (...) sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (t_{i+1} - t_i), m the intervals' middles.
     """
+    if w.device.type == "cpu":
+        return _Sloped.apply(w, step_kernels.distortion, (t,))
     return _Distortion.apply(t.detach(), w)
 
 
-class _Interlevel(torch.autograd.Function):
-    """The kernel finds the slopes along with the loss."""
+class _Sloped(torch.autograd.Function):
+    """A loss of w whose kernel takes other arrays, then w, and finds the slopes along with the loss."""
 
     @staticmethod
-    def forward(ctx, w_prop, t_nerf, w_nerf, t_prop, half_width, eps):
-        arrays = (t_nerf, w_nerf, t_prop, w_prop)
-        (out,) = step_kernels.run(step_kernels.interlevel, [w_prop.shape[-1] + 1], arrays, half_width, eps)
+    def forward(ctx, w, kernel, arrays, *scalars):
+        (out,) = step_kernels.run(kernel, [w.shape[-1] + 1], (*arrays, w), *scalars)
         ctx.save_for_backward(out[..., :-1])
         return out[..., -1].clone()
 
@@ -65,11 +67,11 @@ class _Interlevel(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, g):
         (slopes,) = ctx.saved_tensors
-        return g[..., None] * slopes, None, None, None, None, None
+        return g[..., None] * slopes, *[None] * (len(ctx.needs_input_grad) - 1)
 
 
 class _Distortion(torch.autograd.Function):
-    """The loss is w' Q w, with the matrix Q of mean distances; Q w takes two running sums."""
+    """`distortion_loss` on any device, as the kernel finds it."""
 
     @staticmethod
     def forward(ctx, t, w):

@@ -127,3 +127,28 @@ def interlevel(begin, end, edges, weights, at, proposal, half_width, eps, out):
             total += ratio * ratio * (proposal[ray, i] + eps)
             out[ray, i] = -ratio * (2.0 + ratio)
         out[ray, n] = total
+
+
+@kernel(error_model="numpy")
+def distortion(begin, end, edges, weights, out):
+    """The slopes by the weights (rays, S), then, in a last column, the loss.
+
+    It is w' Q w, with the matrix Q of mean distances; Q w takes two running sums.
+    """
+    n = weights.shape[1]
+    for ray in range(begin, end):
+        start, all_mass, all_moment = np.float64(edges[ray, 0]), 0.0, 0.0
+        for i in range(n):
+            all_mass += weights[ray, i]
+            all_moment += weights[ray, i] * (0.5 * (edges[ray, i] + np.float64(edges[ray, i + 1])) - start)
+        mass, moment, total = 0.0, 0.0, 0.0
+        for i in range(n):
+            weight = np.float64(weights[ray, i])
+            middle = 0.5 * (edges[ray, i] + np.float64(edges[ray, i + 1])) - start
+            mass += weight
+            moment += weight * middle
+            distance = middle * (2 * mass - all_mass) - (2 * moment - all_moment)
+            distance += weight * (np.float64(edges[ray, i + 1]) - edges[ray, i]) / 3
+            out[ray, i] = 2 * distance
+            total += weight * distance
+        out[ray, n] = total
