@@ -19,7 +19,7 @@ RAYS_PER_PIECE = 32
 
 ANGLES = tuple(math.pi / 3 * k for k in (0, 2, 4, 3, 5, 1))
 STEPS = tuple(3 / math.sqrt(7) * (2 * j / 5 - 1) for j in range(6))
-UNIT = np.float32([[math.cos(a), math.sin(a)] for a in ANGLES])
+UNIT = np.array([[math.cos(a), math.sin(a)] for a in ANGLES], np.float32)
 
 
 def axes_across(directions: Tensor) -> tuple[Tensor, Tensor]:

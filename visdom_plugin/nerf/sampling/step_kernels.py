@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,9 @@ RAYS_PER_PIECE = 128
 LEAST_WEIGHT = 1e-12  # so that a ray that meets nothing is sampled evenly over its intervals
 
 
-def run(kernel, columns: Sequence[int], arrays: Sequence[Tensor], *scalars: float) -> list[Tensor]:
+def run(
+    kernel, columns: Sequence[int], arrays: Sequence[Tensor], *scalars: float | np.floating[Any]
+) -> list[Tensor]:
     """Runs a kernel over rays.
 
     Args:
