@@ -57,6 +57,9 @@ class Decoder(nn.Module):
 class ZeroRfLite(MarchedField[ZeroRfConfig]):
     """See `visdom_plugin.training.protocols.Method` for what each call does."""
 
+    # A quarter of the other marched fields': features and hidden units of all samples are in memory at once.
+    rays_at_once = 1 << 12
+
     def choose_frame(self, views: Views) -> Frame:
         return fit_cube(views, self.config.fit_margin)
 
