@@ -1,4 +1,4 @@
-"""Every option that a command in README.md or docs/ is shown with is one that the command has."""
+"""Commands in README.md and docs/ have only options that there are; tables have a command, numbers have a page."""
 
 import re
 import shlex
@@ -54,3 +54,49 @@ def test_the_options_shown_are_there(words, capsys):
 
 def test_commands_are_found():
     assert len(COMMANDS) > 20 and set(MODULES) <= {words[0] for words in COMMANDS.values()}
+
+
+FINDINGS = sorted((ROOT / "docs/findings").glob("*.md"))
+SAID = r"not\s+kept|cannot be repeated|commands of all tables are at the end|in\s+these\s+runs"
+"""How a page says that its tables are earlier measurements, or where else their command stands."""
+
+
+def unexplained(text: str) -> list[str]:
+    """Headings below which there is a table and neither a command nor a word on why there is none."""
+    whole = re.search(r"commands of all tables are at the end", text)
+    parts = re.split(r"^(?=##+ )", re.sub(r"^```.*?^```$", "```", text, flags=re.M | re.S), flags=re.M)
+    tables = [part for part in parts if re.search(r"^\|", part, re.M)]
+    return [p.splitlines()[0] for p in tables if not (whole or "```" in p or re.search(SAID, p))]
+
+
+@pytest.mark.parametrize("page", FINDINGS, ids=lambda p: p.stem)
+def test_a_table_of_the_findings_has_its_command_or_says_why_not(page):
+    assert unexplained(page.read_text(encoding="utf-8")) == []
+
+
+def test_a_table_without_a_command_is_found():
+    table = "\n| a |\n| --- |\n| 1 |\n"
+    text = f"# A\n## B\n{table}\n```\n# run\n```\n## C\n{table}\n### D\n{table}\nThe script was not\nkept.\n"
+    assert unexplained(text) == ["## C"]
+
+
+def drifted(readme: str, root: Path) -> list[str]:
+    """Numbers in a row of the README that no number of the page rounds to that the row links to."""
+    found = []
+    for row in re.findall(r"^\|.*docs/findings/.*$", readme, re.M):
+        cell = re.sub(r"`[^`]*`", "", row.split("|")[2])
+        pages = re.findall(r"\((docs/findings/\w+\.md)", cell)
+        text = " ".join((root / page).read_text(encoding="utf-8") for page in pages)
+        there = {float(n.replace(",", "")) for n in re.findall(r"\d[\d,]*(?:\.\d+)?", text)}
+        for number in re.findall(r"\d[\d,]*(?:\.\d+)?", re.sub(r"\]\([^)]*\)|\^\d", "", cell)):
+            digits, value = len(number.partition(".")[2]), float(number.replace(",", ""))
+            if value not in {round(n, digits) for n in there}:
+                found.append(f"{number}: {row.split('|')[1].strip()}")
+    return found
+
+
+def test_numbers_of_the_readme_are_those_of_the_pages_that_it_links_to():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(re.findall(r"^\|.*docs/findings/", readme, re.M)) >= 7
+    assert drifted(readme, ROOT) == []
+    assert drifted(readme.replace("222 of 225", "223 of 225"), ROOT) == ["223: a check before training"]
