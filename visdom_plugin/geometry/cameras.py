@@ -270,23 +270,6 @@ def rays_of(cameras: Cameras, uv_px: Tensor | None = None) -> Rays:
     return Rays(origins, directions)
 
 
-def rays_of_pixels(cameras: Cameras, view: Tensor, pixel: Tensor) -> Rays:
-    """Rays through the centres of single pixels of a batch of cameras.
-
-    Args:
-        cameras: (N,) cameras.
-        view: (n,) int64 camera of each pixel.
-        pixel: (n,) int64 its number in the image, row by row.
-
-    Returns:
-        Rays (n, 3) float32, each the same whichever pixels are asked for beside it.
-    """
-    chosen = cameras[view]
-    uv = torch.stack([pixel % chosen.width, pixel // chosen.width], -1)
-    rays = rays_of(chosen, (uv + 0.5).to(chosen.intrinsics)[:, None])
-    return Rays(rays.origins[:, 0].float(), rays.directions[:, 0].float())
-
-
 def pixel_radius(cameras: Cameras) -> Tensor:
     """Radius of a pixel's cone at distance 1: the pixel's width times 2 / sqrt(12) (mip-NeRF).
 

@@ -59,7 +59,7 @@ class PixelSampler(Protocol):
     def bound_pixels(
         self, pixels: Tensor, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
     ) -> RayBounds:
-        """The same as `bound` on `geometry.cameras.rays_of_pixels`, bit for bit on the CPU.
+        """The same as `bound` on `geometry.pixel_rays.rays_of_pixels`, bit for bit on the CPU.
 
         Args:
             pixels: (n,) int64 numbers among the cameras' pixels, view by view and row by row.

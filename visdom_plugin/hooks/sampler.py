@@ -9,8 +9,9 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.geometry.cameras import Cameras, rays_of_pixels
+from visdom_plugin.geometry.cameras import Cameras
 from visdom_plugin.geometry.local_frame import capture_ball
+from visdom_plugin.geometry.pixel_rays import rays_of_pixels
 from visdom_plugin.hooks import torch_ops
 from visdom_plugin.hooks.protocols import EmptyRays, RayBounds
 from visdom_plugin.hooks.settings import SamplerSettings

@@ -9,7 +9,8 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.geometry.camera_paths import draw_between
-from visdom_plugin.geometry.cameras import Cameras, pixel_radius, rays_of_pixels
+from visdom_plugin.geometry.cameras import Cameras, pixel_radius
+from visdom_plugin.geometry.pixel_rays import rays_of_pixels
 from visdom_plugin.geometry.rotations import slerp
 from visdom_plugin.hooks.protocols import EmptyRays
 from visdom_plugin.hull.hull import Hull

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from visdom_plugin.compute.transfer import send
 from visdom_plugin.errors import SceneError
-from visdom_plugin.geometry.cameras import pixel_radius, rays_of_pixels
+from visdom_plugin.geometry.cameras import pixel_radius
+from visdom_plugin.geometry.pixel_rays import rays_of_pixels
 from visdom_plugin.scene import Views
 from visdom_plugin.seeding import generator
 from visdom_plugin.training.protocols import PixelBatch, ViewBatch
@@ -27,6 +28,7 @@ class DataManager:
     def __init__(self, views: Views, seed: int, device: torch.device | str = "cpu"):
         self.seed, self.device = seed, torch.device(device)
         self._cameras = views.cameras.to(self.device)
+        self._radii = pixel_radius(self._cameras)
         # Views keep what they find out about themselves, such as their size as numbers.
         self._each = [views.cameras[i].to(self.device) for i in range(len(views))]
         self._images = [image.to(self.device) for image in views.images]
@@ -86,7 +88,7 @@ class DataManager:
             *rays_of_pixels(self._cameras, view, flat - self._starts[view]),
             rgb[flat].float() / 255,
             mask[flat].float(),
-            pixel_radius(self._cameras[view]),
+            self._radii[view],
             None if self._known is None else self._known[view],
             flat,
         )
