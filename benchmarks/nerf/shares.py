@@ -43,7 +43,6 @@ PARTS = {
     "weights and compositing": "weights_from_density composite composite_packed",
     "losses": "mask_loss antialiased_interlevel_loss distortion_loss curve_distances photograph_on psnr_of",
     "occupancy": "update",
-    "backward, own functions": "",
     "backward, autograd": "backward",
     "optimiser": "optimise",
 }
@@ -107,7 +106,7 @@ def watch(clock: Clock) -> None:
         for name, value in list(vars(space).items()):
             if isinstance(space, type) and issubclass(space, torch.autograd.Function):
                 if name == "backward":
-                    timed = clock.within(value.__func__, "backward, own functions")
+                    timed = clock.within(value.__func__, f"backward of {space.__name__.strip('_')}")
                     setattr(space, name, staticmethod(timed))
             elif isinstance(value, FunctionType):
                 if name in names and value not in known:
@@ -144,7 +143,7 @@ def measure(name: str, scene, clock: Clock, threads: int, steps: int, rays: int)
     print(f"\n{name}, {threads} threads: {1e3 * typical:.2f} ms a step\n")
     print(f"| part | operations | {' | '.join(KERNELS)} |\n|" + " --- |" * 5)
     sums = [0.0] * 3
-    for part in (*PARTS, GLUE):
+    for part in dict.fromkeys((*PARTS, *(part for part, _ in clock.spent))):
         times = [1e3 * statistics.median(s.get((part, kind), 0.0) for s in kept) for kind in KERNELS]
         if sum(times):
             print(f"| {part} | {count.seen[part]} | " + " | ".join(f"{t:.2f}" for t in times) + " |")

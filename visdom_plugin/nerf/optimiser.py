@@ -7,9 +7,15 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+SMALL = 1 << 14
+"""Numbers of a tensor below which it is a part of a larger one: Adam wakes all threads for every tensor."""
+
 
 class FieldOptimiser:
     """One fused Adam over several groups of named parameters.
+
+    Small parameters of a group become views of one tensor, which is what Adam sees; one without a gradient counts
+    as one whose gradient is 0.
 
     Args:
         groups: pairs of named parameters and weight decay.
@@ -29,14 +35,26 @@ class FieldOptimiser:
     ):
         self.clip = clip
         self.parameters = {name: p for named, _ in groups for name, p in named.items()}
+        self._joint: list[tuple[nn.Parameter, list[nn.Parameter]]] = []
         kind = torch.optim.AdamW if decoupled else torch.optim.Adam
         self.adam = kind(
-            [{"params": list(named.values()), "weight_decay": decay} for named, decay in groups],
+            [{"params": self._join(list(named.values())), "weight_decay": decay} for named, decay in groups],
             lr=0.0,
             betas=betas,
             eps=eps,
             fused=True,
         )
+
+    def _join(self, parameters: list[nn.Parameter]) -> list[nn.Parameter]:
+        """What Adam is handed for the parameters of a group."""
+        small = [p for p in parameters if p.numel() < SMALL]
+        if len(small) < 2:
+            return parameters
+        joint = nn.Parameter(torch.cat([p.detach().reshape(-1) for p in small]))
+        for p, part in zip(small, _parts(joint.detach(), small), strict=True):
+            p.data = part
+        self._joint.append((joint, small))
+        return [*(p for p in parameters if p.numel() >= SMALL), joint]
 
     def step(self, learning_rate: float) -> None:
         """One step; gradients are dropped afterwards."""
@@ -44,28 +62,63 @@ class FieldOptimiser:
             group["lr"] = learning_rate
         if self.clip is not None:
             nn.utils.clip_grad_norm_(self.parameters.values(), self.clip)
+        for joint, small in self._joint:
+            gradients = (torch.zeros_like(p) if p.grad is None else p.grad for p in small)
+            joint.grad = torch.cat([g.reshape(-1) for g in gradients])
         self.adam.step()
-        self.adam.zero_grad(set_to_none=True)
+        self.drop_gradients()
+
+    def drop_gradients(self) -> None:
+        """Leaves no gradient for the next step to add to."""
+        for parameter in self.parameters.values():
+            parameter.grad = None
+
+    def _moments(self) -> dict[nn.Parameter, dict[str, Tensor]]:
+        """Adam's moments and step count by parameter, the moments as views."""
+        found: dict[nn.Parameter, dict[str, Tensor]] = {
+            p: dict(self.adam.state.get(p, {})) for p in self.parameters.values()
+        }
+        for joint, small in self._joint:
+            for key, value in self.adam.state.get(joint, {}).items():
+                values = [value.clone() for _ in small] if key == "step" else _parts(value, small)
+                for p, part in zip(small, values, strict=True):
+                    found[p][key] = part
+        return found
 
     def state_dict(self) -> dict[str, Tensor]:
         """Parameters, moments and step counts."""
-        out = {}
+        moments, out = self._moments(), {}
         for name, parameter in self.parameters.items():
             out[name] = parameter.detach()
-            for key, value in self.adam.state.get(parameter, {}).items():
+            for key, value in moments[parameter].items():
                 out[f"adam.{name}.{key}"] = torch.as_tensor(value)
         return out
 
     @torch.no_grad()
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Takes over what `state_dict` gave."""
+        moments: dict[nn.Parameter, dict[str, Tensor]] = {}
         for name, parameter in self.parameters.items():
             parameter.copy_(state[name])
             prefix = f"adam.{name}."
-            moments = {k[len(prefix) :]: v.clone() for k, v in state.items() if k.startswith(prefix)}
-            if moments:
-                # The count of steps, too: fused Adam reads it on the device.
-                self.adam.state[parameter] = {k: v.to(parameter.device) for k, v in moments.items()}
+            # The count of steps, too: fused Adam reads it on the device.
+            moments[parameter] = {
+                k[len(prefix) :]: v.to(parameter.device, copy=True)
+                for k, v in state.items()
+                if k.startswith(prefix)
+            }
+        for joint, small in self._joint:
+            each = [moments.pop(p) for p in small]
+            moments[joint] = {
+                key: value if key == "step" else torch.cat([m[key].reshape(-1) for m in each])
+                for key, value in each[0].items()
+            }
+        self.adam.state.update({p: found for p, found in moments.items() if found})
+
+
+def _parts(flat: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
+    """Views of a flat tensor in the shapes of others, one after the other."""
+    return [part.view_as(p) for part, p in zip(flat.split([p.numel() for p in like]), like, strict=True)]
 
 
 def warm_up_and_steps(

@@ -185,4 +185,4 @@ class RadianceField(CorrectsColours, ABC, Generic[Config]):
             radii=pixel_radius(camera).expand(n),
         )
         self.train_step(batch, 1).total.backward()
-        self.optimiser.adam.zero_grad(set_to_none=True)
+        self.optimiser.drop_gradients()
