@@ -12,7 +12,6 @@ import torch
 
 from tests.nerf.encoding import hash_twin
 from visdom_plugin.errors import ConfigError
-from visdom_plugin.nerf.encoding import hash_cpu
 from visdom_plugin.nerf.encoding.hash_grid import (
     HashLayout,
     default_backend,
@@ -208,14 +207,19 @@ def test_initial_table_and_mean_squares():
         assert squares[level].item() == pytest.approx(rows.double().square().mean().item(), rel=1e-5)
 
 
-@pytest.mark.parametrize("large", [False, True])
-def test_mean_squares_agree_with_torch(large, monkeypatch):
-    monkeypatch.setattr(hash_cpu, "LARGE", 0 if large else 1 << 40)
+def test_mean_squares_agree_with_torch_on_any_number_of_threads():
     layout = HashLayout(levels=3, features=3, base_resolution=3, max_resolution=40, log2_table_size=13)
     table = initial_table(layout, torch.Generator().manual_seed(0), 0.5)
     slow = mean_square_per_level(table.double(), layout)  # float64 takes plain torch
-    fast = mean_square_per_level(table, layout)
-    torch.testing.assert_close(fast.double(), slow, rtol=1e-6, atol=1e-12)
+    before, fast = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            fast.append(mean_square_per_level(table, layout))
+    finally:
+        torch.set_num_threads(before)
+    torch.testing.assert_close(fast[0].double(), slow, rtol=1e-6, atol=1e-12)
+    assert torch.equal(*fast)
     assert mean_square_per_level(table.requires_grad_(), layout).requires_grad
 
 

@@ -166,7 +166,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
             loss = distortion_loss(curve_distances(last.t), last.weights).mean()
             losses["distortion"] = c.distortion_weight * loss
         if c.hash_decay:
-            losses["hash_decay"] = c.hash_decay * reduce(torch.add, (x.sum() for x in squares))
+            losses["hash_decay"] = c.hash_decay * torch.cat(squares).sum()
         losses |= self.prior_losses(step) | self.empty_losses(len(batch.mask), step)
         return StepOutput(losses, {"psnr": psnr_of(error)})
 

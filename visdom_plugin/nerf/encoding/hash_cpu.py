@@ -19,10 +19,6 @@ from visdom_plugin.nerf.encoding.hash_layout import HashLayout
 
 PIECES_PER_LEVEL = 4
 """Launching a piece costs some 10 us; below this many, two threads wait for one another at the end."""
-LARGE = 1 << 20
-"""Numbers in a table from which it is worth while to square them on several threads."""
-SUMMED = 1024
-"""Squares summed in float32 at a time."""
 
 
 def encode_cpu(
@@ -104,26 +100,9 @@ def _share_of_each(layout: HashLayout) -> Tensor:
 
 def mean_squares(table: Tensor, layout: HashLayout) -> Tensor:
     """(levels,) means of the squared features of each level of a table, without gradient."""
-    levels = [rows.detach().numpy() for rows in table.split(layout.sizes)]
-    out = torch.empty(len(levels))
-
-    def find(begin: int, end: int) -> None:
-        for level in range(begin, end):
-            out[level] = _mean_square(levels[level].reshape(-1))
-
-    parallel_for(find, len(levels), _grain(table, layout.sizes))
+    out = torch.empty(layout.levels)
+    offsets = _describe(layout)[-1]
+    parallel_for(
+        hash_kernels.mean_squares, layout.levels, 1, _flat(table), layout.features, offsets, _flat(out)
+    )
     return out
-
-
-def _grain(table: Tensor, sizes: tuple[int, ...]) -> int:
-    """Levels in a piece: all of a small table, which a second thread would not have done sooner."""
-    return 1 if table.numel() > LARGE else len(sizes)
-
-
-def _mean_square(values: np.ndarray) -> float:
-    """Of (n,), exact enough in float32: sums of blocks are summed in float64."""
-    whole = len(values) // SUMMED * SUMMED
-    blocks = values[:whole].reshape(-1, SUMMED)
-    total = np.einsum("ij,ij->i", blocks, blocks).sum(dtype=np.float64)
-    rest = values[whole:]
-    return float((total + np.einsum("i,i->", rest, rest)) / len(values))

@@ -21,6 +21,8 @@ from numba.extending import intrinsic
 
 from visdom_plugin.compute.kernels import kernel
 
+SUMMED = 1024
+"""Squares summed in float32 at a time."""
 BLOCK = 256
 """Points per block, at most; groups are not divided."""
 PLANE = BLOCK + 16
@@ -304,3 +306,24 @@ def encode_backward(
         if len(decay):
             for i in range(offsets[level] * features, offsets[level + 1] * features):
                 g_table[i] += decay[level] * table[i]
+
+
+@kernel(fast=True)
+def _sum_squares(values, first, last):
+    total = np.float32(0)
+    for i in range(first, last):
+        total += values[i] * values[i]
+    return total
+
+
+@kernel(error_model="numpy")
+def mean_squares(begin, end, table, features, offsets, out):
+    """Means (levels,) of a table's squared features; item 0 is the last level. Sums of blocks are added up in
+    float64, so that they are exact enough."""
+    levels = len(out)
+    for level in range(levels - end, levels - begin):
+        first, last = offsets[level] * features, offsets[level + 1] * features
+        total = 0.0
+        for block in range(first, last, SUMMED):
+            total += _sum_squares(table, block, min(block + SUMMED, last))
+        out[level] = total / (last - first)
