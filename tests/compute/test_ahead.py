@@ -65,6 +65,12 @@ def test_a_listed_kernel_is_there_and_takes_so_many_arguments(text):
     assert Kernel.of(function.py_func, types).text == text
 
 
+def test_each_kernel_is_compiled_once():
+    """For one kind of arguments, on which its callers agree."""
+    names = [text.split()[0] for text in LISTED["kernels"]]
+    assert sorted(names) == sorted(set(names))
+
+
 def test_every_method_has_a_job(lister):
     assert set(lister.jobs()) == set(LISTED["jobs"])
     methods = {ahead.training_job(name) for name in registry.installed().presets}

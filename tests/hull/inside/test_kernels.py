@@ -111,7 +111,7 @@ def test_every_square_with_foreground_has_its_most_central_pixel(edge):
 def test_rays_go_through_the_voxels_they_cross(rays_and_grid):
     rays, grid = rays_and_grid
     u = (np.random.default_rng(3).random(grid.shape) < 0.03).astype(np.float32)
-    state = find_met(rays, u)
+    state = find_met(rays, u.astype(np.uint8))
     for n in range(len(rays)):
         met = any(u[v] for v in voxels_on(rays.origins[rays.views[n]], rays.directions[n], grid.shape))
         assert state[rays.squares[n]] == (1 if met else 2)
@@ -125,7 +125,7 @@ def test_a_ray_that_misses_gets_the_voxel_of_most_views_for_least_energy(rays_an
     rays = rays.that_meet(cap)
     u = ((random.random(grid.shape) < 0.03) & (cap > 0)).astype(np.float32)
     blurred, cut = random.random(grid.shape).astype(np.float32), 0.4
-    state, wanted, missed = find_met(rays, u), u.copy(), 0
+    state, wanted, missed = find_met(rays, u.astype(np.uint8)), u.copy(), 0
     for n in range(len(rays)):
         if state[rays.squares[n]] == 1:
             continue
@@ -156,7 +156,7 @@ def test_what_is_given_is_a_ball_within_the_cap(rays_and_grid):
     u = np.zeros(grid.shape, np.float32)
     blurred = np.zeros(grid.shape, np.float32)
     blurred[6, 6, 6] = 0.5
-    one = rays.that_meet(blurred * 2)
+    one = rays.that_meet((blurred > 0).view(np.uint8))
     give_back(one, u, cap, blurred, 0.5, ball=2.0)
     centre = np.stack(np.meshgrid(*(np.arange(n) - 6 for n in grid.shape), indexing="ij"), -1)
     assert np.array_equal(u > 0, ((centre**2).sum(-1) <= 4) & (cap > 0))

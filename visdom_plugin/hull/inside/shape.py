@@ -75,7 +75,7 @@ def shape_inside(
         hull.occupancy[window], grid, radius, cameras.to("cpu"), silhouettes, config, photographs
     )
     cap = pool(hull.occupancy[window], 1)
-    u = (u > 0.5).astype(np.uint8)
+    u = (u > 0.5).astype(np.float32)
     cut = cut_level(radius / grid.voxel)
     covered = [
         _cover(u, cap, blurred, cut, grid, cameras[i : i + 1].to("cpu"), silhouettes.mask(i))

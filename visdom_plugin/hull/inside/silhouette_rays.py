@@ -42,9 +42,9 @@ class Rays:
     def __len__(self) -> int:
         return len(self.views)
 
-    def that_meet(self, u: np.ndarray) -> Rays:
-        """Only the rays that meet a voxel above 0.5."""
-        met = find_met(self, u)[self.squares] == _MET
+    def that_meet(self, filled: np.ndarray) -> Rays:
+        """Only the rays that meet a voxel of (X, Y, Z) uint8 that is not 0."""
+        met = find_met(self, filled)[self.squares] == _MET
         return replace(
             self, directions=self.directions[met], views=self.views[met], squares=self.squares[met]
         )
@@ -147,15 +147,15 @@ def _go_on(
 @kernel()
 def _meet(
     begin: int, end: int, origins: np.ndarray, directions: np.ndarray, views: np.ndarray,
-    squares: np.ndarray, u: np.ndarray, state: np.ndarray,
+    squares: np.ndarray, filled: np.ndarray, state: np.ndarray,
 ) -> None:  # fmt: skip
-    shape = u.shape
+    shape = filled.shape
     voxel, step, ahead, apart = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(3)
     for r in range(begin, end):
         met = False
         on = _enter(origins[views[r]], directions[r], shape, voxel, step, ahead, apart)
         while on and not met:
-            met = u[voxel[0], voxel[1], voxel[2]] > 0.5
+            met = filled[voxel[0], voxel[1], voxel[2]] != 0
             on = _go_on(shape, voxel, step, ahead, apart)
         state[squares[r]] = _MET if met else _MISSED
 
@@ -214,10 +214,15 @@ def _fill_balls(centres: np.ndarray, ball: float, cap: np.ndarray, u: np.ndarray
                         u[x, y, z] = 1
 
 
-def find_met(rays: Rays, u: np.ndarray) -> np.ndarray:
-    """What became of the ray of each square: uint8, 0 where there is none, 1 where it meets u > 0.5, else 2."""
+def find_met(rays: Rays, filled: np.ndarray) -> np.ndarray:
+    """What became of the ray of each square: uint8, 0 where there is none, 1 where it meets a filled voxel, else 2.
+
+    Args:
+        filled: (X, Y, Z) uint8, not 0 where a voxel is filled.
+    """
     state = np.zeros(int(rays.starts[-1]), np.uint8)
-    parallel_for(_meet, len(rays), 1024, rays.origins, rays.directions, rays.views, rays.squares, u, state)
+    lines = (rays.origins, rays.directions, rays.views, rays.squares)
+    parallel_for(_meet, len(rays), 1024, *lines, filled, state)
     return state
 
 
@@ -241,7 +246,7 @@ def give_back(
     Returns:
         How many rays missed.
     """
-    state = find_met(rays, u)
+    state = find_met(rays, (u > 0.5).view(np.uint8))
     missed = np.flatnonzero(state[rays.squares] == _MISSED)
     chosen = np.empty(len(missed), np.int64)
     lines = (rays.origins, rays.directions, rays.views, rays.projections, rays.sizes, rays.starts)
