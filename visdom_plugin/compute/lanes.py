@@ -13,7 +13,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 from llvmlite import ir
 from numba import types
@@ -102,6 +102,8 @@ def _operands(context: Any, builder: Any, kinds: Any, arguments: Any, element: A
 def _register(function: Any, emit: Callable[[Any, Any, Any], Any], to: Callable[[Any], Any]) -> None:
     @infer_global(function)
     class _Template(AbstractTemplate):
+        metadata: ClassVar = {"target": "cpu"}  # tried first, see kernels.py
+
         def generic(self, arguments: Any, keywords: Any) -> Any:
             element = _element_of(arguments)
             result = None if element is None else to(element)

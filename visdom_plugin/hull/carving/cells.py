@@ -57,7 +57,7 @@ def _judge(
     nearest = depth - reach
     if nearest <= slack[view, 2]:
         return _OPEN
-    width, height = sizes[view]
+    width, height = sizes[view, 0], sizes[view, 1]
     u0, u1 = _bound_pixel(0, view, i0, i1, j0, j1, k0, k1, x, y, z, dx, dy, dz, depth, nearest, slack)
     if u1 < 0 or u0 >= width:
         return _UNSEEN
@@ -150,7 +150,7 @@ def _keep_centres(
             if depth > 0:
                 u = ((x[view, 0, i] + y[view, 0, j]) + z[view, 0, k]) / depth
                 v = ((x[view, 1, i] + y[view, 1, j]) + z[view, 1, k]) / depth
-                width, height = sizes[view]
+                width, height = sizes[view, 0], sizes[view, 1]
                 if u >= 0 and u < width and v >= 0 and v < height:
                     visible += 1
                     occupied += pixels[offsets[view] + np.int64(v) * width + np.int64(u)]

@@ -141,15 +141,18 @@ def _count_slabs(
     for i in range(begin, end):
         triangles, vertices = 0, 0
         for j in range(ny + 1):
-            k = _next_cube(grid, i, j, 0)
-            while k <= nz:
+            k = 0
+            while True:
+                k = _next_cube(grid, i, j, k)
+                if k > nz:
+                    break
                 case = _case_at(grid, i, j, k)
                 triangles += counts[case]
                 # This cube owns the three edges that leave its first corner.
                 first = case & 1
                 for axis in range(3):
                     vertices += (case >> (1 << axis) & 1) != first
-                k = _next_cube(grid, i, j, k + 1)
+                k += 1
         triangles_of[i], vertices_of[i] = triangles, vertices
 
 
@@ -159,8 +162,11 @@ def _number_slab(grid: np.ndarray, i: int, first: int, ids: np.ndarray, vertices
     _, ny, nz = grid.shape
     count = first
     for j in range(ny + 1):
-        k = _next_cube(grid, i, j, 0)
-        while k <= nz:
+        k = 0
+        while True:
+            k = _next_cube(grid, i, j, k)
+            if k > nz:
+                break
             case = _case_at(grid, i, j, k)
             for axis in range(3):
                 if (case >> (1 << axis) & 1) != (case & 1):
@@ -168,7 +174,7 @@ def _number_slab(grid: np.ndarray, i: int, first: int, ids: np.ndarray, vertices
                     vertices[count, 0], vertices[count, 1], vertices[count, 2] = i - 0.5, j - 0.5, k - 0.5
                     vertices[count, axis] += 0.5
                     count += 1
-            k = _next_cube(grid, i, j, k + 1)
+            k += 1
 
 
 @kernel()
@@ -180,8 +186,7 @@ def _build(
     nx, ny, nz = grid.shape
     for chunk in range(first, last):
         begin, end = chunk * (nx + 1) // chunks, (chunk + 1) * (nx + 1) // chunks
-        here = np.zeros((ny + 2, nz + 2, 3), np.int64)
-        ahead = np.zeros((ny + 2, nz + 2, 3), np.int64)
+        here, ahead = np.empty((ny + 2, nz + 2, 3), np.int64), np.empty((ny + 2, nz + 2, 3), np.int64)
         if begin < end:
             _number_slab(grid, begin, first_vertex[begin], here, vertices)
         for i in range(begin, end):
@@ -189,8 +194,11 @@ def _build(
                 _number_slab(grid, i + 1, first_vertex[i + 1], ahead, vertices)
             f = first_triangle[i]
             for j in range(ny + 1):
-                k = _next_cube(grid, i, j, 0)
-                while k <= nz:
+                k = 0
+                while True:
+                    k = _next_cube(grid, i, j, k)
+                    if k > nz:
+                        break
                     case = _case_at(grid, i, j, k)
                     for t in range(counts[case]):
                         for m in range(3):
@@ -198,7 +206,7 @@ def _build(
                             ids = ahead if offsets[e, 0] else here
                             faces[f, m] = ids[j + offsets[e, 1], k + offsets[e, 2], axes[e]]
                         f += 1
-                    k = _next_cube(grid, i, j, k + 1)
+                    k += 1
             here, ahead = ahead, here
 
 

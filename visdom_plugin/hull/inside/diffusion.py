@@ -45,11 +45,14 @@ def _blur_slabs(begin: int, end: int, u: np.ndarray, weights: np.ndarray, out: n
     """Blurs the slabs x = const along y and z."""
     _, ny, nz = u.shape
     reach = len(weights) // 2
-    padded = np.zeros(nz + 2 * reach, np.float32)
+    padded = np.empty(nz + 2 * reach, np.float32)
+    row = padded[reach : reach + nz]
+    for k in range(reach):
+        padded[k], padded[nz + reach + k] = 0, 0
     for i in range(begin, end):
         for j in range(ny):
-            row = padded[reach : reach + nz]
-            row[:] = 0
+            for k in range(nz):
+                row[k] = 0
             for t in range(max(-reach, -j), min(reach, ny - 1 - j) + 1):
                 w = weights[t + reach]
                 for k in range(nz):

@@ -87,6 +87,7 @@ def _contradict(
 ) -> None:  # fmt: skip
     """Rows (x, y), flattened."""
     _, ny, nz = blurred.shape
+    total = np.empty(3)
     for row in range(begin, end):
         i, j = row // ny, row % ny
         x, y = lower[0] + (i + 0.5) * voxel, lower[1] + (j + 0.5) * voxel
@@ -94,7 +95,9 @@ def _contradict(
             if abs(blurred[i, j, k] - 0.5) > _SURFACE:
                 continue
             z = lower[2] + (k + 0.5) * voxel
-            count, total, squares = 0, np.zeros(3), 0.0
+            count, squares = 0, 0.0
+            for c in range(3):
+                total[c] = 0
             for v in range(len(sizes)):
                 p = projections[v]
                 depth = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
