@@ -13,7 +13,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 from llvmlite import ir
 from numba import types
@@ -102,7 +102,7 @@ def _operands(context: Any, builder: Any, kinds: Any, arguments: Any, element: A
 def _register(function: Any, emit: Callable[[Any, Any, Any], Any], to: Callable[[Any], Any]) -> None:
     @infer_global(function)
     class _Template(AbstractTemplate):
-        metadata: ClassVar = {"target": "cpu"}  # tried first, see kernels.py
+        metadata = {"target": "cpu"}  # noqa: RUF012 (numba's); tried first, see kernels.py
 
         def generic(self, arguments: Any, keywords: Any) -> Any:
             element = _element_of(arguments)

@@ -215,7 +215,7 @@ def _fill_balls(centres: np.ndarray, ball: float, cap: np.ndarray, u: np.ndarray
 
 
 def find_met(rays: Rays, filled: np.ndarray) -> np.ndarray:
-    """What became of the ray of each square: uint8, 0 where there is none, 1 where it meets what is filled, else 2.
+    """What became of the ray of each square: uint8, 0 without a ray, 1 where it meets what is filled, else 2.
 
     Args:
         filled: (X, Y, Z) uint8, not 0 where a voxel is filled.
