@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import shlex
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -252,29 +253,53 @@ def _only_reading(root: Path) -> str:
             todo=f"say which one is meant: --data-format {' or --data-format '.join(found)}",
             topic="layout",
         )
+    cause, todo = _find_near(root) or (_guess(root), None)
     layouts = "; ".join(f"{name}: {form.holds}" for name, form in FORMATS.items() if form.recogniser)
     raise SceneError(
         "this folder is not a scene of a known layout",
         where=root,
-        cause=_guess(root),
-        todo=f"pass a folder of one of these layouts, or name it with --data-format. {layouts}",
+        cause=cause,
+        todo=todo or f"pass a folder of one of these layouts, or name it with --data-format. {layouts}",
         topic="no-scene",
     )
 
 
-def _guess(root: Path) -> str:
+_LEVELS = ("one level", "two levels", "three levels")
+
+
+def _find_near(root: Path) -> tuple[str, str] | None:
+    """The scene that a folder is a part of, or that lies in it: cause and what to do; None where there is none."""
     from datamodules.files.images import ENDINGS  # with NumPy and Pillow, which --help need not wait for
 
-    if root.name in ("images", "masks", "sparse", "0", "rgbs", "matting"):
-        return "one level too deep: the scene is the folder above"
+    whole = root.resolve()
+    for level, folder in zip(_LEVELS[:2], whole.parents, strict=False):
+        found = {}
+        with suppress(OSError):  # nobody asked for this one
+            found = recognise(folder)
+        if found:
+            shown = root.parent if folder == whole.parent and root.name == whole.name else folder
+            reason = " or ".join(f"{name} ({reason})" for name, reason in found.items())
+            return (
+                f"{level} too deep: {shown} is a scene, {reason}",
+                f"name that folder: --data {_quoted(shown)}",
+            )
     for folder in _folders_below(root, 3):
         if recognise(folder):
             if any(p.suffix.lower() in ENDINGS for p in folder.rglob("*")):
-                levels = ("one level", "two levels", "three levels")[len(folder.relative_to(root).parts) - 1]
-                return f"{levels} too high: {folder} looks like a scene"
-            return (
-                f"poses lie in {folder.relative_to(root).as_posix()}, without photographs: put both together"
-            )
+                level = _LEVELS[len(folder.relative_to(root).parts) - 1]
+                return f"{level} too high: {folder} looks like a scene", f"name it: --data {_quoted(folder)}"
+            poses = folder.relative_to(root).as_posix()
+            return f"poses lie in {poses}, without photographs", "put poses and photographs into one folder"
+    return None
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
+
+
+def _guess(root: Path) -> str:
+    from datamodules.files.images import ENDINGS
+
     for name, meaning in _ELSEWHERE.items():
         if (root / name).exists():
             return f"{name} is {meaning}"

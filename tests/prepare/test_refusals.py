@@ -233,3 +233,16 @@ def test_a_box_beside_the_cameras(photographs, tmp_path, capsys):
     assert "the box that the object is in" in refusal(photographs.folder, tmp_path, capsys, *words)
     words = ["--box", "1", "0", "0", "-1", "1", "1"]
     assert "is no box" in refusal(photographs.folder, tmp_path, capsys, *words)
+
+
+def test_a_folder_above_the_photographs_names_the_one_that_holds_them(folder, tmp_path, capsys):
+    folder.mkdir()
+    save(folder / "phone", "0.jpg")
+    for i in range(3):
+        save(folder / "masks", f"{i}.png")
+    said = refusal(folder, tmp_path, capsys)
+    assert "they lie in folders below: phone (1), masks (3)" in said
+    assert f"visdom-prepare {folder}/phone\n" in said
+    shutil.rmtree(folder / "masks")
+    (folder / "phone/0.jpg").rename(folder / "phone/0.txt")
+    assert "another folder is meant" in refusal(folder, tmp_path, capsys)

@@ -18,6 +18,7 @@ from datamodules.recognise import FORMATS, find_folder
 from visdom_plugin import registry
 from visdom_plugin.cli.early import WORD, Early, read_early
 from visdom_plugin.errors import ConfigError, unknown_name
+from visdom_plugin.hull.settings import HullSettings
 from visdom_plugin.training.runs.config_io import as_plain, differences, from_plain, read_mapping
 
 if TYPE_CHECKING:
@@ -247,6 +248,25 @@ def name_method(early: Early) -> str | None:
     if len(early.methods) > 1:
         raise ConfigError(f"one method at a time, please: {' '.join(WORD + name for name in early.methods)}")
     return early.methods[0] if early.methods else None
+
+
+def most_views(options: SceneOptions) -> int | None:
+    """How many views train at most, by the options alone; None where a file or the scene tells."""
+    listed = options.train_list
+    if listed is None:
+        return options.views
+    return None if listed == "all" or Path(listed).exists() else len(list(filter(None, listed.split(","))))
+
+
+def refuse_large_k(options: SceneOptions, hull: Any) -> None:
+    """Raises ConfigError where a hull's K is above the number of views that the options ask for.
+
+    Args:
+        hull: settings of a hull; anything else has no K.
+    """
+    views = most_views(options)
+    if views is not None and isinstance(hull, HullSettings):
+        hull.require_views(views)
 
 
 def read_options(options: Any) -> dict[str, Any]:

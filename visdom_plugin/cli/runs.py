@@ -12,6 +12,7 @@ from visdom_plugin.cli import options
 from visdom_plugin.cli.scenes import make_data_manager, open_scene
 from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import CheckpointError, ConfigError
+from visdom_plugin.hull.settings import HullSettings
 from visdom_plugin.scene import Scene, hold_out
 
 if TYPE_CHECKING:
@@ -47,6 +48,13 @@ def train_as_asked(
         tensorboard=tensorboard,
         snapshots=common.snapshots,
     )
+
+
+def refuse_large_k(config: Any, scene: Scene) -> None:
+    """Raises ConfigError where the K of a method's hull is above the number of training views with a mask."""
+    hull, views = getattr(config, "hull", None), len(scene.train.with_masks())
+    if isinstance(hull, HullSettings) and views:
+        hull.require_views(views)
 
 
 def default_run_dir(scene: str, views: int, method: str, seed: int) -> Path:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, NoReturn
 
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.hull.wording import wording
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
@@ -86,3 +87,28 @@ class HullSettings:
             shaped = len(corners) == 2 and all(len(c) == 3 for c in corners)
             if not shaped or not all(-math.inf < a < b < math.inf for a, b in zip(*corners, strict=True)):
                 refuse(f"bounds are {self.bounds}", "use two corners (x, y, z), each lower below its upper")
+
+    def require_views(self, views: int) -> None:
+        """Sees to it that there are enough views for K, before anything is carved.
+
+        Args:
+            views: with a mask.
+
+        Raises:
+            ConfigError: K is above their number.
+        """
+        if self.kind == "visdom" and isinstance(self.k, int):
+            refuse_large_k(self.k, views)
+
+
+def refuse_large_k(k: int, views: int) -> None:
+    """Raises ConfigError for a K above the number of views that carve."""
+    if k <= views:
+        return
+    said = wording()
+    fewer = f"; or a smaller K: {said.set_k.format(k=min(3, views))}" if views > 1 else ""
+    raise ConfigError(
+        f"K = {k} is more than the {views} view{'s' * (views != 1)} trained on: nothing is seen by {k} of them",
+        where="k",
+        todo=said.more_views.format(count=k) + fewer,
+    )

@@ -17,6 +17,7 @@ class Wording(NamedTuple):
     look: str
     """Where each view's part in a hull is shown."""
     more_views: str
+    """{count} stands for how many are needed."""
     poses: str
     """What to do about poses in another convention; "" leaves it to what was found."""
     sheet: str
@@ -29,7 +30,7 @@ LIBRARY = Wording(
     set_k="VisibleDomain(k={k})",
     allow_misses="VisibleDomain(max_misses=1)",
     look="see what visdom_plugin.hull.checks.check.check(cameras, masks) finds",
-    more_views="use three views or more",
+    more_views="use {count} views or more",
     poses="",
     sheet="draw masks and hull over the photographs",
     refine="refine its pose: visdom_plugin.hull.refine.poses.refine_poses(cameras, masks, free=[{view}])",
@@ -38,7 +39,7 @@ COMMANDS = Wording(
     set_k="--k {k}",
     allow_misses="visdom-hull --max-misses 1, visdom-train --method.hull.max-misses 1",
     look="look at each view's part in it: visdom-hull DIR --diagnose",
-    more_views="use more views: --views 3 or more",
+    more_views="use more views: --views {count} or more",
     poses="change the poses in the scene's file: `visdom-check DIR` tells how",
     sheet="look at the contact sheet (visdom-check DIR --out OUT)",
     refine="refine the poses of a COLMAP model or a transforms.json: visdom-prepare PHOTOS --poses POSES --masks "

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import math
+import shlex
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ import numpy as np
 from datamodules.files.images import ENDINGS, decode_photograph, read_header
 from datamodules.files.paths import read_file, stem
 from datamodules.views.find_files import loose_key
+from datamodules.views.mask_files import OTHER_FOLDERS
 from visdom_plugin.compute.waiting import counting
 from visdom_plugin.errors import SceneError, list_some
 
@@ -74,6 +77,11 @@ def find_photographs(folder: Path) -> tuple[list[Photograph], list[str]]:
                 f"it holds raw photographs: {list_some(raw, 3)}",
                 "develop them to JPEG, TIFF or PNG",
             )
+        elif inner := _folders_of_photographs(base):
+            cause = f"they lie in {'folders' if len(inner) > 1 else 'a folder'} below: " + list_some(
+                f"{path.relative_to(base)} ({count})" for path, count in inner.items()
+            )
+            todo = f"name the one with the photographs: visdom-prepare {shlex.quote(str(next(iter(inner))))}"
         raise SceneError(
             "there are no photographs in this folder", where=base, cause=cause, todo=todo, topic="no-scene"
         )
@@ -100,6 +108,18 @@ def _list(folder: Path) -> tuple[Path, list[Path]]:
     if inner.is_dir() and not any(p.suffix.lower() in ENDINGS for p in paths):
         return inner, files_of(inner)
     return folder, paths
+
+
+def _folders_of_photographs(base: Path) -> dict[Path, int]:
+    """Folders up to two levels below that hold images, with how many; most first, and masks last."""
+    found = {}
+    for folder in (*base.glob("*"), *base.glob("*/*")):
+        if folder.is_dir() and not folder.name.startswith("."):
+            with suppress(OSError):
+                count = sum(p.suffix.lower() in ENDINGS and p.is_file() for p in folder.iterdir())
+                found |= {folder: count} if count else {}
+    masks = ("masks", *OTHER_FOLDERS)
+    return dict(sorted(found.items(), key=lambda x: (x[0].name.lower() in masks, -x[1], x[0])))
 
 
 def _refuse_clashes(files: Sequence[Path], base: Path) -> None:

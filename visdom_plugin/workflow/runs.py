@@ -15,7 +15,7 @@ from visdom_plugin.cli.commands.check import find_briefly, warn_of_faults
 from visdom_plugin.cli.commands.render import cameras_along
 from visdom_plugin.cli.options import Common, choose_budget, resolve_device
 from visdom_plugin.cli.output.reports import report_finished
-from visdom_plugin.cli.runs import default_run_dir, load_again, refuse_other_scene
+from visdom_plugin.cli.runs import default_run_dir, load_again, refuse_large_k, refuse_other_scene
 from visdom_plugin.cli.scenes import make_data_manager
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.figures.contact_sheet import to_bytes, write_png
@@ -180,6 +180,7 @@ def train(
     chosen, _ = choose_budget(asked.budget, found)
     config = from_plain(preset.settings(chosen), settings, f"settings of {preset.name}")
     path = Path(out) if out is not None else default_run_dir(scene.name, len(scene.train), preset.name, seed)
+    refuse_large_k(config, scene)
     warn_of_faults(scene, inverted=bool(scene.source.get("invert_masks")))
     finish = partial(report_finished, scene=scene, run_dir=path, device=found, check=find_briefly)
     training.train(

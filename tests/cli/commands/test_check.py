@@ -182,11 +182,6 @@ def test_the_command_to_train_with_makes_large_pictures_small(tmp_path, longest,
     assert common.train_list == "a,b"
 
 
-def test_a_k_that_asks_too_much_exits_with_1(folder, capsys):
-    assert main([str(folder), "-k", "5", "--json"]) == 1
-    assert json.loads(capsys.readouterr().out)["findings"][0]["kind"] == "covisibility"
-
-
 def test_training_is_warned(sound, caplog):
     def scene_of(capture):
         views = Views(capture.cameras, capture.images, capture.masks, capture.names)

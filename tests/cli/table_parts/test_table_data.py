@@ -173,3 +173,10 @@ def test_a_column_names_built_in_scenes(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "there is no built-in scene 'builtin:kitchen'" in said and "without `root:`" in said
     assert "builtin:chair" in said and "two.yaml" in said
+
+
+def test_a_k_above_the_number_of_views_is_told_before_a_run(root):
+    (task,) = _plan(root, settings={"hull.k": 5}, views=[4]).tasks.values()
+    assert "K = 5 is more than the 4 views" in task.trouble and "hull.k" in task.trouble
+    (task,) = _plan(root, settings={"hull.k": 4}, views=[4]).tasks.values()
+    assert not task.trouble

@@ -201,3 +201,27 @@ def test_a_model_far_below_and_a_scene_far_below(views, tmp_path):
     (folder / "distorted").rename(folder / "own")
     with pytest.raises(SceneError, match="poses lie in own, without photographs"):
         load(folder)
+
+
+@pytest.mark.parametrize("name", ["images", "photos", "my photos"])
+def test_the_folder_of_photographs_in_place_of_the_scenes_is_told(views, tmp_path, monkeypatch, name):
+    folder = w.write_nerfstudio(views, tmp_path / "s")
+    inner = folder / name
+    inner.mkdir(exist_ok=True)
+    with pytest.raises(SceneError, match=r"one level too deep: .*transforms\.json") as caught:
+        load(inner)
+    assert caught.value.todo == f"name that folder: --data {folder}"
+    monkeypatch.chdir(folder)
+    with pytest.raises(SceneError, match="one level too deep") as caught:
+        load(name)
+    assert caught.value.todo == "name that folder: --data ."
+    (inner / "far").mkdir()
+    with pytest.raises(SceneError, match="two levels too deep"):
+        load(inner / "far")
+    (folder / "transforms.json").unlink()
+    with pytest.raises(SceneError) as caught:
+        load(inner)
+    assert "too deep" not in str(caught.value)
+    with pytest.raises(SceneError, match="one level too high") as caught:
+        load(w.write_nerfstudio(views, tmp_path / "above/it").parent)
+    assert caught.value.todo == f"name it: --data {tmp_path}/above/it"

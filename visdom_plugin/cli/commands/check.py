@@ -15,11 +15,12 @@ import tyro
 
 from datamodules.built_in import on_disk
 from visdom_plugin.cli.entry import run
-from visdom_plugin.cli.options import FolderOptions, read_options
+from visdom_plugin.cli.options import FolderOptions, read_options, refuse_large_k
 from visdom_plugin.cli.output.reports import training_command
 from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.compute.waiting import phase
 from visdom_plugin.errors import PAGE, ConfigError, SceneError, list_some
+from visdom_plugin.hull.settings import HullSettings
 
 if TYPE_CHECKING:
     from visdom_plugin.hull.checks.check import Check
@@ -68,6 +69,9 @@ def _main(argv: Sequence[str]) -> int:
         raise ConfigError(f"k is {options.k}", where="--k", todo="use a whole number from 1, or auto")
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         raise ConfigError("this is a file, not a folder", where=f"--out {options.out}", todo="name a folder")
+    k = None if options.k == "auto" else options.k
+    if k is not None:
+        refuse_large_k(options, HullSettings(k=k))
     started = time.perf_counter()
     load_torch()
     from visdom_plugin.cli.scenes import carving_views, open_scene
@@ -81,7 +85,8 @@ def _main(argv: Sequence[str]) -> int:
         _show({"scene": place.name, "views": [], "findings": [_unreadable(error)], "notes": []}, options)
         return FOUND
     loaded = time.perf_counter()
-    k = None if options.k == "auto" else options.k
+    if k is not None:
+        HullSettings(k=k).require_views(len(views))
     found = check_views(views, masks, k=k, layout=scene.source.get("layout"))
     found = replace(found, findings=[*doubt_masks(scene, views.names), *found.findings])
     if len(views) < min(2, len(scene.train)):

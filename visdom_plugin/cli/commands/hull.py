@@ -14,7 +14,7 @@ import tyro
 from visdom_plugin.cli.clashes import NEEDS_OF_HULL, refuse_unread
 from visdom_plugin.cli.commands.check import check_views, describe_check, summarise_fit
 from visdom_plugin.cli.entry import run
-from visdom_plugin.cli.options import FolderOptions, read_options
+from visdom_plugin.cli.options import FolderOptions, read_options, refuse_large_k
 from visdom_plugin.cli.output.terminal import load_torch
 from visdom_plugin.compute import ahead
 from visdom_plugin.compute.waiting import phase
@@ -83,6 +83,7 @@ def _main(argv: Sequence[str]) -> None:
     names = [f.name for f in fields(VisibleDomain)]
     domain = VisibleDomain(**{name: getattr(options, name) for name in names})
     inside = _inside_config(options)
+    refuse_large_k(options, domain)
     if options.frames < 1:
         raise ConfigError(f"--frames is {options.frames}; it must be at least 1")
     ahead.prepare("hull")
@@ -98,6 +99,8 @@ def _main(argv: Sequence[str]) -> None:
         fill=False,
         test=masks is not None and masks.cameras == "test",
     )
+    if views := len(scene.train.with_masks()):
+        domain.require_views(views)
     report = report_hull(
         domain, scene, out=options.out, diagnosing=options.diagnose, masks=masks, inside=inside
     )

@@ -31,6 +31,7 @@ def _train(argv: Sequence[str]) -> None:
         sys.stdout.write(options.dump(request))
         return
     common.find_scene_folder()
+    options.refuse_large_k(common, getattr(request.config, "hull", None))
     if common.view:
         require_viser()
     quiet = common.quiet
@@ -43,11 +44,12 @@ def _train(argv: Sequence[str]) -> None:
     device = options.resolve_device(common.device)
 
     from visdom_plugin.cli.commands.check import warn_of_faults
-    from visdom_plugin.cli.runs import default_run_dir, train_as_asked
+    from visdom_plugin.cli.runs import default_run_dir, refuse_large_k, train_as_asked
     from visdom_plugin.cli.scenes import open_scene
     from visdom_plugin.scene import describe_masks
 
     scene = open_scene(common.data, **options.read_options(common))
+    refuse_large_k(request.config, scene)
     folder = common.out or default_run_dir(scene.name, len(scene.train), request.preset.name, common.seed)
     if not quiet:
         say(f"data: {scene.name}, {len(scene.train)} training views, {len(scene.test)} test views")

@@ -13,6 +13,7 @@ from typing import Any
 from datamodules.built_in import named_built_in
 from visdom_plugin.cli.options import READING, Common, resolve_lists
 from visdom_plugin.errors import ConfigError, SceneError, unknown_name
+from visdom_plugin.hull.settings import HullSettings
 from visdom_plugin.tables.spec import Settings
 from visdom_plugin.training.runs.config_io import from_plain
 
@@ -61,6 +62,12 @@ class DataHasher:
             SceneError: for a scene that cannot be read.
             ConfigError: for a reading that does not fit the scene.
         """
+        hull = getattr(settings, "hull", None)
+        if isinstance(hull, HullSettings):
+            try:
+                hull.require_views(int(str(reading["views"])))
+            except ConfigError as error:  # of this job; the table's others can be run
+                raise SceneError(error.what, where="hull.k", todo=error.todo, topic=error.topic) from error
         if _name_built_in(folder) is not None:
             from datamodules.synthetic.config import SyntheticConfig
 

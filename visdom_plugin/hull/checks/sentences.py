@@ -41,7 +41,7 @@ def say_too_few(count: int) -> Finding:
         tuple(range(count)),
         "certain",
         count,
-        wording().more_views,
+        wording().more_views.format(count=3),
     )
 
 
