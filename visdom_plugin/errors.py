@@ -1,4 +1,4 @@
-"""Errors of a user, said so that they can be mended, and lists of names in them."""
+"""Errors of a user, said so that they can be mended, and the numbers and lists of names in them."""
 
 from __future__ import annotations
 
@@ -96,6 +96,11 @@ def list_some(names: Iterable[object], most: int = 5) -> str:
     """Names with commas between, "a, b, c, ... (9 in all)" where there are more than `most`."""
     words = [str(name) for name in names]
     return ", ".join(words[:most]) + (f", ... ({len(words)} in all)" if len(words) > most else "")
+
+
+def count_of(number: int, one: str, many: str | None = None) -> str:
+    """ "1 view" or "3 views"; `many` where an s is not enough."""
+    return f"{number:,} {one if number == 1 else many or one + 's'}"
 
 
 def did_you_mean(name: object, valid: Iterable[object]) -> str:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from visdom_plugin.errors import SceneError, list_some
+from visdom_plugin.errors import SceneError, count_of, list_some
 from visdom_plugin.geometry.cameras import Cameras
 
 MaskOrigin = Literal["given", "missing", "hull", "colour", "whole"]
@@ -199,18 +199,24 @@ def describe_masks(views: Views) -> list[str]:
     Reads no pixels where there is nothing but given masks.
     """
     known = {
-        "given": "foreground masks; the background is known to be empty",
-        "missing": "views without a mask",
-        "hull": "views whose mask is the outline of the other views' hull (they do not carve)",
-        "colour": "views without a mask, for colour only inside the other views' hull (no carving, no mask loss)",
-        "whole": "views without a mask, as photographed, background included",
+        "given": ("foreground mask", "; the background is known to be empty"),
+        "missing": ("view", " without a mask"),
+        "hull": ("view", " with the outline of the other views' hull for a mask (not used to carve)"),
+        "colour": (
+            "view",
+            " without a mask, for colour inside the other views' hull (no carving, no mask loss)",
+        ),
+        "whole": ("view", " without a mask, as photographed, background included"),
     }
     origins = [views.mask_origin(i) for i in range(len(views))]
-    lines = [f"{origins.count(kind)} {text}" for kind, text in known.items() if kind in origins]
+    lines = [
+        count_of(origins.count(kind), noun) + text for kind, (noun, text) in known.items() if kind in origins
+    ]
     shares = [float(g.double().mean()) for g in views.ignore if g is not None]
     if shares:
+        mean = sum(shares) / len(shares)
         lines.append(
-            f"{len(shares)} views with ignored pixels ({sum(shares) / len(shares):.1%} of each on average): "
-            "unknown, so in no loss and no metric, and they do not carve"
+            f"{count_of(len(shares), 'view')} with ignored pixels ({mean:.1%} of each on average): unknown, so "
+            "in no loss and no metric, and they do not carve"
         )
     return lines

@@ -163,13 +163,13 @@ def _pick_training(
         )
     train = pick_evenly(pool, wanted)
     log.info(
-        "%s: no index file for %d views; they are spread evenly over the %d free ones: %s",
+        "%s: nothing lists %d training views; they are spread evenly over the %d not held out for testing: %s",
         root,
         wanted,
         len(pool),
         list_some((names[i] for i in train), 12),
     )
-    return train, f"training views spread evenly over {len(pool)}"
+    return train, f"training views spread evenly over the {len(pool)} others"
 
 
 def _refuse_shared(train: list[int], tested: list[int], where: str, root: Path) -> None:
@@ -193,8 +193,8 @@ def _no_index_file(root: Path, views: int | None, available: list[int], by_hand:
     listed = ", ".join(map(str, available))
     other = f"; or choose by hand, spread evenly for example: --train-list {by_hand}" if by_hand else ""
     raise SceneError(
-        f"there is no sparse_{'<N>' if views is None else views}.txt"
-        + (f"; this scene has index files for {listed} views" if available else ""),
+        f"there is no sparse_{'<N>' if views is None else views}.txt, the list of that many training views"
+        + (f"; this scene has such index files for {listed} views" if available else ""),
         where=root,
         todo=f"pass --views with one of {listed}{other}"
         if available

@@ -227,9 +227,9 @@ def test_the_line_counts_kernels_and_seconds_left(monkeypatch):
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
     helper.began()
-    assert helper.describe() == "compiling kernels, once on this machine: 0 of 6, 0 s"
+    assert helper.describe() == "compiling kernels, once on this machine: 0 s, 0 done, at most 6 to go"
     now, ready = 104.0, set("abcd")
-    assert helper.describe() == "compiling kernels, once on this machine: 4 of 6, 4 s, about 2 s left"
+    assert helper.describe() == "compiling kernels, once on this machine: 4 s, 4 done, at most 2 to go (2 s)"
     ready = set("abcdef")
     assert helper.describe() == "compiling kernels, once on this machine: 4 s"
     helper.ended()

@@ -64,7 +64,7 @@ def test_missing_masks_are_an_error_unless_asked_for(bare):
     ):
         fill_masks(bare, "error")
     lonely = replace(bare, train=strip(bare.train, {0, 1, 2, 4}))
-    with pytest.raises(SceneError, match="only 1 training views"):
+    with pytest.raises(SceneError, match="only 1 training view has one"):
         fill_masks(lonely, "hull")
 
 
@@ -113,7 +113,7 @@ class Outline:
 def test_a_test_view_without_a_mask_is_rendered_and_not_measured(whole, bare, others, way, tmp_path, caplog):
     """The means are those of the other views, and nobody is praised for filling the hull."""
     test = fill_masks(bare, way, DOMAIN).test
-    assert "1 of 4 test views have no mask" in caplog.text and "test_001" in caplog.text
+    assert "test views without a mask, 1 of 4" in caplog.text and "test_001" in caplog.text
     outlines = outline_views(others, whole.test, range(4))
     for masks in (whole.test.masks, outlines):
         method = Outline(whole.test, masks)

@@ -41,7 +41,8 @@ class Reading:
     data_format: DataFormat | None = None
     """Layout of the scene's folder; detected by default."""
     train_list: str | None = None
-    """Training views to use in place of --views: an index file, comma-separated positions and names, or all."""
+    """Training views to use in place of --views: positions and names with commas between; a text file of
+    zero-based positions, an index file; or all."""
     test_list: str | None = None
     """Test views, in the same way."""
     split: str | None = None

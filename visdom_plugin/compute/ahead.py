@@ -23,7 +23,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from visdom_plugin.compute.waiting import describe_parts, screen, watch
+from visdom_plugin.compute.waiting import screen, seconds_left, watch
 
 LIST = Path(__file__).with_name("ahead.json")
 """What commands call: kernels with types as `Kernel.spell` writes them, and their numbers by job."""
@@ -175,11 +175,17 @@ class Helper:
         screen.end(self.describe)
 
     def describe(self) -> str:
-        """How far it is, and how long it will take."""
+        """How many are there, and how many may follow: work goes on as soon as the one that it waits for is there,
+        and a run need not call all of the list."""
         took = time.monotonic() - (self._began or time.monotonic())
         done, total = sum(k.is_cached() for k in self._kernels), len(self._kernels)
-        name = "compiling kernels, once on this machine"
-        return f"{name}: {took:.0f} s" if done == total else describe_parts(name, done, total, took)
+        text = f"compiling kernels, once on this machine: {took:.0f} s"
+        if done == total:
+            return text
+        seconds = seconds_left(done, total, took)
+        return f"{text}, {done} done, at most {total - done} to go" + f" ({seconds} s)" * (
+            seconds is not None
+        )
 
 
 _process: subprocess.Popen[bytes] | None = None

@@ -171,7 +171,12 @@ def describe_parts(name: str, done: int, total: int, took: float) -> str:
     Args:
         took: seconds so far.
     """
-    text = f"{name}: {done} of {total}, {took:.0f} s"
+    text, left = f"{name}: {done} of {total}, {took:.0f} s", seconds_left(done, total, took)
+    return text if left is None else f"{text}, about {left} s left"
+
+
+def seconds_left(done: int, total: int, took: float) -> int | None:
+    """Of a phase of parts alike; None where it is too early to tell."""
     if done < _TELLING or took < 1:
-        return text
-    return f"{text}, about {math.ceil(took / done * max(total - done, 0))} s left"
+        return None
+    return math.ceil(took / done * max(total - done, 0))

@@ -71,6 +71,7 @@ class VisibleDomain(HullSettings):
         # Settings stand on every command line: torch and numba are loaded when a hull is carved, the check, which
         # needs OpenCV, when it is asked.
         from visdom_plugin.hull.carving.carve import carve_silhouettes
+        from visdom_plugin.hull.carving.keep_rule import describe_rule
         from visdom_plugin.hull.carving.votes import gather_silhouettes
         from visdom_plugin.hull.checks.causes.intrinsics import may_be_other_units
         from visdom_plugin.hull.checks.coverage import looks_sound
@@ -135,9 +136,10 @@ class VisibleDomain(HullSettings):
             )
         made, dropped = hull.summary, hull.summary["components_dropped"]
         log.info(
-            "hull: %s, %d views; %s; %d of %s voxels of %.4g, %d of %d pieces%s, %.2f s",
-            self.kind, len(silhouettes), made["agreement_means"], hull.voxels, "x".join(map(str, hull.shape)),
-            hull.voxel_size, made["components"], made["components_found"], dropped and f" ({dropped})",
+            "hull: %s%s; %d of %s voxels of %.4g; %d of %d separate pieces kept%s; %.2f s",
+            "" if self.kind == "visdom" else f"{self.kind}, ", describe_rule(made), hull.voxels,
+            "x".join(map(str, hull.shape)), hull.voxel_size, made["components"], made["components_found"],
+            dropped and f" ({dropped})",
             made["seconds"] + made["bounds_seconds"],
         )  # fmt: skip
         return hull

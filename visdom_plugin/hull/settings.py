@@ -20,9 +20,10 @@ class HullSettings:
     """K, the fewest views that must see a voxel. "n-1": all but one. "auto": 3, or 2 where 3 loses more of a mask.
     It is --k of the commands and hull.k in tables; the matrix of intrinsics has nothing to do with it."""
     agreement: float = 0.95
-    """Share of the views that see a voxel that must have it inside their mask, in (0, 1]."""
+    """Share of the views that see a voxel that must have it inside their mask, in (0, 1]: 0.95 means all of them
+    where there are fewer than 20."""
     max_misses: int | None = None
-    """Views that may miss, in place of the agreement."""
+    """In place of the agreement: how many of the views that see a voxel may have it outside their mask."""
     kind: Literal["visdom", "traditional", "unit-sphere", "released-go"] = "visdom"
     """Which hull of the paper's comparison: the visible domain, without K, that inside a ball, or GaussianObject's
     rule."""
@@ -38,11 +39,11 @@ class HullSettings:
     resolution: int = 256
     """Voxels along the grid's longest side."""
     components: Literal["explain", "drop-small", "all", "largest"] = "explain"
-    """Which connected pieces (26 neighbours) stay. "explain": those that cover foreground which no better piece
-    covers, so that thin parts that broke off stay and pieces in front of or behind the object go, whatever their
-    size. "drop-small": those not small beside the largest. "all". "largest". Where one view is enough
-    ("traditional", "unit-sphere", k = 1) "explain" finds the bounds, but of the grid's pieces only small ones are
-    dropped: what single views leave is what tells these kinds from the others."""
+    """Which pieces stay; they touch each other nowhere (26 neighbours). "explain": those that cover foreground
+    which no better piece covers, so that thin parts that broke off stay and pieces in front of or behind the
+    object go, whatever their size. "drop-small": those not small beside the largest. "all". "largest". Where one
+    view is enough ("traditional", "unit-sphere", k = 1) "explain" finds the bounds, but of the grid's pieces only
+    small ones are dropped: what single views leave is what tells these kinds from the others."""
     min_component_fraction: float = 0.05
     """Pieces below this fraction of the largest piece's volume are small."""
     dilate_px: int = 0
@@ -109,6 +110,6 @@ def refuse_large_k(k: int, views: int) -> None:
     fewer = f"; or a smaller K: {said.set_k.format(k=min(3, views))}" if views > 1 else ""
     raise ConfigError(
         f"K = {k} is more than the {views} view{'s' * (views != 1)} trained on: nothing is seen by {k} of them",
-        where="k",
+        where=said.set_k.format(k=k),
         todo=said.more_views.format(count=k) + fewer,
     )

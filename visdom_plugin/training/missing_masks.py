@@ -20,7 +20,7 @@ from typing import Literal, TypeVar, overload
 import torch
 from torch import Tensor
 
-from visdom_plugin.errors import SceneError, list_some
+from visdom_plugin.errors import SceneError, count_of, list_some
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.scene import NO_MASKS, MaskOrigin, Scene, Views
@@ -55,14 +55,14 @@ def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> S
     if (missing or unmeasured) and way == "error":
         absent = [scene.train.names[i] for i in missing] + [scene.test.names[i] for i in unmeasured]
         raise SceneError(
-            f"{len(absent)} views have no mask: {list_some(absent)}",
+            f"{count_of(len(absent), 'view has', 'views have')} no mask: {list_some(absent)}",
             where=scene.name,
             todo="make masks for them, or pass --data.missing-masks colour|hull",
             topic="mask-missing",
         )
     if unmeasured:
         log.warning(
-            "%d of %d test views have no mask: they are rendered, but not measured (%s)",
+            "test views without a mask, %d of %d: they are rendered, but not measured (%s)",
             len(unmeasured), len(scene.test), list_some([scene.test.names[i] for i in unmeasured]),
         )  # fmt: skip
     if not missing:
@@ -75,9 +75,10 @@ def fill_masks(scene: Scene, way: Way, domain: VisibleDomain | None = None) -> S
         return replace(scene, train=replace(scene.train, mask_origins=whole))
     if given < 2:
         raise SceneError(
-            f"{len(missing)} training views have no mask: {list_some([scene.train.names[i] for i in missing])}",
+            f"{count_of(len(missing), 'training view has', 'training views have')} no mask: "
+            + list_some([scene.train.names[i] for i in missing]),
             where=scene.name,
-            cause=f"and only {given} training views have one: a hull needs two",
+            cause=f"and only {count_of(given, 'training view has', 'training views have')} one: a hull needs two",
             todo="make masks for them" if given else NO_MASKS,
             topic="mask-missing",
         )

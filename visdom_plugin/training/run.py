@@ -343,7 +343,8 @@ def assess(
             reference.save(run_dir / "hull" / REFERENCE)
     if len(views):
         size = f"{int(views.cameras.width[0])} x {int(views.cameras.height[0])}"
-        log.info("evaluation: %d test views of %s pixels, the size of training", len(views), size)
+        s = "s" * (len(views) != 1)
+        log.info("evaluation: %d test view%s of %s pixels, the size of training", len(views), s, size)
     with Progress(
         len(views), title="evaluation", unit="test view", quiet=quiet or not len(views)
     ) as progress:

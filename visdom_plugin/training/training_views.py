@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from visdom_plugin.errors import count_of
 from visdom_plugin.figures.contact_sheet import (
     SHEET_ROWS,
     draw_sheet,
@@ -68,8 +69,8 @@ def draw_training_views(
     shown = shown_on_sheet(len(views))
     size = (int(views.cameras[0].width), int(views.cameras[0].height))
     log.info(
-        "pictures: %d training views and %d of an orbit, at most %d pixels wide or high (photographs: %d x %d)",
-        *(len(shown), ORBIT_VIEWS, LARGEST_PX, *size),
+        "pictures: %s and %d of an orbit, at most %d pixels wide or high (photographs: %d x %d)",
+        *(count_of(len(shown), "training view"), ORBIT_VIEWS, LARGEST_PX, *size),
     )
     centre = None if hull is None else torch.as_tensor(hull.centre)
     round_about = orbit(views.cameras, ORBIT_VIEWS, centre)

@@ -146,7 +146,7 @@ def test_table_and_diagnosis(scene, capsys):
         (["--agreement", "2"], "agreement is 2"),
         (["--resolution", "1"], "resolution is 1"),
         (["--out", "hull.stl"], "hull.stl"),
-        (["-k", "9"], "only 4 views"),
+        (["-k", "9"], "than the 4 views"),
         (["one", "--data", "two"], "two scenes"),
         (["--bounds", "0", "0", "0", "0", "1", "1"], "bounds"),
     ],

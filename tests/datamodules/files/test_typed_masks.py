@@ -135,7 +135,7 @@ def test_the_folder_ignore_is_unknown_and_not_background(tiny, folder):
     assert [train.ignored(i) is not None for i in range(4)] == [False, False, True, False]
     assert torch.equal(train.ignored(2), torch.from_numpy(unknown) > 0)
     assert all(map(torch.equal, train.masks, tiny.train.masks)), "the foreground is another matter"
-    assert "1 views with ignored pixels" in describe_masks(train)[1]
+    assert "1 view with ignored pixels" in describe_masks(train)[1]
     _, carving, _ = train.silhouettes()
     assert carving[2][10:20, 5:30].all()
     half = load(folder, downscale=2.6).train
@@ -151,4 +151,4 @@ def test_views_without_a_mask_come_back_as_missing(tiny, folder):
     assert [scene.train.mask_origin(i) for i in range(4)] == ["given", "given", "missing", "given"]
     assert [scene.test.mask_origin(i) for i in range(3)] == ["given", "missing", "given"]
     assert scene.train.masks[2].all() and torch.equal(scene.train.masks[0], tiny.train.masks[0])
-    assert describe_masks(scene.train)[1] == "1 views without a mask"
+    assert describe_masks(scene.train)[1] == "1 view without a mask"

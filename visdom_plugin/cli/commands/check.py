@@ -19,7 +19,7 @@ from visdom_plugin.cli.options import FolderOptions, read_options, refuse_large_
 from visdom_plugin.cli.output.reports import training_command
 from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.compute.waiting import phase
-from visdom_plugin.errors import PAGE, ConfigError, SceneError, list_some
+from visdom_plugin.errors import PAGE, ConfigError, SceneError, count_of, list_some
 from visdom_plugin.hull.settings import HullSettings
 
 if TYPE_CHECKING:
@@ -294,9 +294,11 @@ def _table(report: dict[str, Any]) -> None:
     colours = {"certain": "red", "likely": "yellow", "possible": "cyan", "note": "dim"}
     rows = [*((f["sure"], f) for f in report["findings"]), *(("note", f) for f in report["notes"])]
     count = len(report["findings"])
-    said = "nothing wrong" if count == 0 else "1 finding" if count == 1 else f"{count} findings"
+    said = count_of(count, "finding") if count else "nothing wrong"
     choice = report.get("choice")
-    views = f"{len(report['views'])} of {choice['free']} views" if choice else f"{len(report['views'])} views"
+    views = count_of(choice["free"] if choice else len(report["views"]), "view")
+    if choice:
+        views = f"{len(report['views'])} of {views}"
     console.print(f"[bold]{escape(report['scene'])}[/bold]: {views}, {said}")
     if rows:
         table = Table(show_edge=False, pad_edge=False, show_lines=True)

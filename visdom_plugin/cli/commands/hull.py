@@ -18,7 +18,7 @@ from visdom_plugin.cli.options import FolderOptions, read_options, refuse_large_
 from visdom_plugin.cli.output.terminal import load_torch
 from visdom_plugin.compute import ahead
 from visdom_plugin.compute.waiting import phase
-from visdom_plugin.errors import ConfigError
+from visdom_plugin.errors import ConfigError, count_of
 from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.hull.inside.config import InsideConfig
 from visdom_plugin.hull.settings import HullSettings
@@ -258,10 +258,12 @@ def _inside_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _table(report: dict[str, Any]) -> str:
+    from visdom_plugin.hull.carving.keep_rule import describe_rule
+
     size = " x ".join(f"{b - a:.4g}" for a, b in zip(*report["extent"], strict=True))
     rows = [
-        ("scene", f"{report['scene']}, {len(report['views'])} views"),
-        ("rule", f"{report['kind']}, K = {report['k']}; {report['agreement_means']}"),
+        ("scene", f"{report['scene']}, {count_of(len(report['views']), 'view')}"),
+        ("rule", f"{report['kind']}: {describe_rule(report)}"),
         *(("data", text) for text in report["masks"]),
         (
             "voxels",
@@ -271,7 +273,7 @@ def _table(report: dict[str, Any]) -> str:
         ("size", f"{size}, volume {report['volume']:.5g}, surface {report['surface_area']:.5g}"),
         (
             "pieces",
-            f"{report['components']} of {report['components_found']} kept"
+            f"{report['components']} of {report['components_found']} separate ones kept"
             + (f"; {report['components_dropped']}" if report["components_dropped"] else ""),
         ),
         ("mesh", "watertight" if report["watertight"] else "not watertight"),

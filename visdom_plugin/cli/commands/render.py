@@ -15,7 +15,7 @@ from visdom_plugin.cli import entry
 from visdom_plugin.cli.options import Device, SceneOptions
 from visdom_plugin.cli.output.terminal import load_torch, say
 from visdom_plugin.cli.subject import Subject, is_splat_file, open_subject
-from visdom_plugin.errors import ConfigError, unknown_name
+from visdom_plugin.errors import ConfigError, count_of, unknown_name
 
 if TYPE_CHECKING:
     from visdom_plugin.geometry.cameras import Cameras
@@ -103,7 +103,7 @@ def _render(argv: Sequence[str]) -> None:
         codec = name_codec(Path(f"x.{options.format}"))
         more = ", which browsers do not play (for H.264: pip install 'visdom-plugin[video]')"
         size = f"{int(cameras.width[0])} x {int(cameras.height[0])}"
-        say(f"{len(cameras)} frames of {size}, codec {codec}" + more * (codec == "mp4v"))
+        say(f"{count_of(len(cameras), 'frame')} of {size}, codec {codec}" + more * (codec == "mp4v"))
     if not options.quiet:
         sys.stdout.write("".join(f"{target}\n" for target in targets.values()))
 

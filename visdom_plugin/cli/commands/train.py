@@ -13,6 +13,7 @@ from visdom_plugin.cli import entry, options
 from visdom_plugin.cli.output.reports import SMALL_PX, SWIFT_PX, swift_factor
 from visdom_plugin.cli.output.terminal import load_torch, say, show_next, show_result
 from visdom_plugin.compute.ahead import prepare, training_job
+from visdom_plugin.errors import count_of
 from visdom_plugin.viewer.serve import require_viser
 
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ def _train(argv: Sequence[str]) -> None:
     refuse_large_k(request.config, scene)
     folder = common.out or default_run_dir(scene.name, len(scene.train), request.preset.name, common.seed)
     if not quiet:
-        say(f"data: {scene.name}, {len(scene.train)} training views, {len(scene.test)} test views")
+        counts = (count_of(len(scene.train), "training view"), count_of(len(scene.test), "test view"))
+        say(f"data: {scene.name}, {', '.join(counts)}")
         if common.budget == "standard" and len(scene.train) < request.preset.standard_views:
             say(
                 f"budget standard gains from {request.preset.standard_views} views on; with {len(scene.train)}, "

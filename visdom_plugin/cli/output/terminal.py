@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from visdom_plugin.compute.waiting import phase, screen
+from visdom_plugin.errors import count_of
 from visdom_plugin.tables.measures import MEASURES
 
 ROWS = (
@@ -85,7 +86,7 @@ def show_result(record: dict[str, Any], folder: Path) -> None:
     console = Console(soft_wrap=True)
     views = len(record["data"]["test"])
     measured = record["metrics"].get("measured_views", views)
-    count = f"{views} test views" if measured == views else f"{measured} of {views} test views"
+    count = ("" if measured == views else f"{measured} of ") + count_of(views, "test view")
     title = f"{record['method']} on {record['scene']}, {count}"
     table = Table(title=title)
     table.add_column("metric")

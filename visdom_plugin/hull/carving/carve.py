@@ -158,12 +158,13 @@ def _say_dropped(sizes: np.ndarray, keep: np.ndarray, policy: str, min_fraction:
     if keep.all():
         return ""
     why = {
-        "explain": "the pieces kept cover the masks without them",
-        "drop-small": f"below {min_fraction:g} of the largest piece's volume",
-        "largest": "not the largest",
+        "explain": "those kept cover the masks without them",
+        "drop-small": f"none has {min_fraction:g} of the largest one's volume",
+        "largest": "only the largest is kept",
     }[policy]
     share = sizes[~keep].sum() / sizes[keep].sum()
-    return f"dropped {np.count_nonzero(~keep)}, {share:.2g} of the volume kept: {why}"
+    count = int(np.count_nonzero(~keep))
+    return f"{count} dropped, together {share:.2g} times the volume kept: {why}"
 
 
 def _visible_region(settings: HullSettings, cameras: Cameras, search: Search) -> Region | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -74,11 +75,21 @@ class KeepRule(NamedTuple):
         ]
         said = f"max_misses {self.max_misses}"
         if self.agreement is not None:
-            said = f"agreement {float(self.agreement):g}"
+            said = f"the agreement: at least {float(self.agreement):g} of them"
         if not misses:
             return f"{said} among at least {self.least_visible} views, but there are only {n}"
         but = "" if misses[-1] == 0 else " but one" if misses[-1] == 1 else f" but {misses[-1]}"
-        return f"inside the masks of all{but} of the views that see it ({said}, {n} views)"
+        return f"inside the masks of all{but} of the views that see it ({said}; {n} views in all)"
+
+
+def describe_rule(summary: Mapping[str, Any]) -> str:
+    """A hull's rule in words: K and what it means, and the agreement.
+
+    Args:
+        summary: of the hull.
+    """
+    seen = f"seen by at least {summary['k']} views (K = {summary['k']}), "
+    return seen * (summary["kind"] == "visdom") + summary["agreement_means"]
 
 
 def as_fraction(agreement: float) -> Fraction:
