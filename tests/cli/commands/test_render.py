@@ -5,10 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from tests.hull.balls import ring
 from visdom_plugin.cli.commands import render, train
+from visdom_plugin.cli.subject import Subject
 from visdom_plugin.figures.contact_sheet import read_png
+from visdom_plugin.geometry.camera_paths import framed
 
 
 @pytest.fixture
@@ -59,7 +63,7 @@ def test_the_line_on_the_codec_names_what_is_missing(trained, monkeypatch, capsy
     monkeypatch.setitem(sys.modules, "av", None)
     assert render.main([str(trained), "--frames", "2"]) == 0
     said = capsys.readouterr().err
-    assert "2 frames of 24 x 20, codec mp4v" in said and "visdom-plugin[video]" in said
+    assert "2 frames of 24 x 20, 0.1 s of video, codec mp4v" in said and "visdom-plugin[video]" in said
 
 
 def test_a_file_of_cameras_is_followed(trained, capsys):
@@ -73,3 +77,33 @@ def test_a_file_of_cameras_is_followed(trained, capsys):
     Path("way.json").write_text("{}")
     assert draw(trained, "--path", "way.json", "--out", "way.mp4") == 2
     assert "camera_path" in capsys.readouterr().err and not Path("way.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "longest", "drawn"),
+    [
+        ("visdom-gs", 100, 640),
+        ("visdom-gs", 800, 800),
+        ("3dgs-go+vd", 4032, 1280),
+        (None, 200, 640),
+        ("ingp+vd", 200, 200),
+        ("zipnerf-lite", 1600, 480),
+    ],
+)
+@pytest.mark.parametrize("tall", [False, True])
+def test_a_first_look_is_large_where_that_costs_little(method, longest, drawn, tall):
+    sizes = (3 * longest // 4, longest) if tall else (longest, 3 * longest // 4)
+    camera = ring(1).resized(torch.tensor([sizes[0]]), torch.tensor([sizes[1]]))
+    subject = Subject(None, None, None, torch.device("cpu"), method and {"method": method})
+    asked = {"run": Path("run"), "path": "orbit"}
+    chosen = framed(camera, *render._choose_size(render.Options(**asked), subject, camera))
+    assert max(int(chosen.width), int(chosen.height)) == drawn
+    assert min(int(chosen.width), int(chosen.height)) == round(0.75 * drawn)
+    for more in ({"width": 50}, {"height": 50}, {"path": "train"}):
+        options = render.Options(**asked | more)
+        assert render._choose_size(options, subject, camera) == (options.width, options.height)
+
+
+def test_an_orbit_lasts_five_seconds(trained, capsys):
+    assert render.main([str(trained)]) == 0
+    assert "120 frames of 24 x 20, 5.0 s of video" in capsys.readouterr().err

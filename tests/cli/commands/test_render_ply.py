@@ -24,7 +24,7 @@ def cloud(tmp_path):
 
 @pytest.mark.parametrize(("path", "count"), [("train", 3), ("orbit", 2), ("between", 2)])
 def test_pictures_are_those_of_the_rasteriser(cloud, path, count, capsys):
-    assert render.main([str(cloud), "--path", path, "--frames", "2", *SMALL]) == 0
+    assert render.main([str(cloud), "--path", path, "--frames", "2", *SMALL, "--width", "50"]) == 0
     folder = cloud.with_name(f"Überall_{path}_frames")
     assert capsys.readouterr().out.strip() == str(folder)
     pictures = sorted(folder.iterdir())

@@ -26,7 +26,10 @@ if TYPE_CHECKING:
 NamedPath = Literal["orbit", "between", "train", "test"]
 Output = Literal["rgb", "depth", "alpha"]
 Format = Literal["mp4", "gif", "png"]
-FRAMES, FPS = 60, 30
+FRAMES, FPS = 120, 24
+SPLATS_PX, FIELDS_PX = (640, 1280), (1, 480)
+"""At least and at most so long is the longer side of an orbit's pictures, else that of the photographs: splats are
+drawn in hundredths of a second, fields in tenths."""
 _SMALL_PX, _SMALL_FRAMES = 96, 12
 """Pictures from which the range of depths is found: their longer side, and their number at most."""
 
@@ -45,17 +48,18 @@ class Options(SceneOptions):
     """orbit: a circle round the object; between: from training view to training view; train, test: these views;
     or a .json file of cameras, as visdom-view and nerfstudio write them (docs/guide/outputs.md)."""
     frames: int | None = None
-    """Number of frames along orbit and between, by default 60; of a file, its cameras, or so many on the way
-    along them."""
+    """Number of frames along orbit and between, by default 120, five seconds; of a file, its cameras, or so many
+    on the way along them."""
     width: int | None = None
-    """Width of the pictures in pixels, by default that of training; the height follows, unless it is given."""
+    """Width of the pictures in pixels; the height follows, unless it is given. By default the size of training,
+    along orbit and between with a longer side of 640 to 1280 pixels for splats, and of 480 at most for fields."""
     height: int | None = None
     """Height in pixels. With both, the view from top to bottom stays, and the sides are cut or widened."""
     outputs: tuple[Output, ...] = ("rgb",)
     """rgb; depth, coloured from near (bright) to far; alpha, the opacity. With png, depth also comes as .npy files
     of float32, in scene units along the camera's axis."""
     fps: int | None = None
-    """Frames per second, by default 30, or what the file of cameras says."""
+    """Frames per second, by default 24, or what the file of cameras says."""
     format: Format | None = None
     """mp4, gif, or png, a folder of numbered images; by default what --out ends in, else mp4."""
     out: Path | None = None
@@ -81,7 +85,7 @@ def _render(argv: Sequence[str]) -> None:
 
     subject = open_subject(options.run, options, options.device, test=options.path == "test")
     cameras, own_fps = cameras_along(options.path, options.frames, subject.scene, subject.hull)
-    cameras = framed(cameras, options.width, options.height)
+    cameras = framed(cameras, *_choose_size(options, subject, cameras))
     fps = options.fps or own_fps or FPS
     targets = {output: target_of(options, output) for output in dict.fromkeys(options.outputs)}
     _check_targets(options, targets, cameras, fps)
@@ -103,9 +107,24 @@ def _render(argv: Sequence[str]) -> None:
         codec = name_codec(Path(f"x.{options.format}"))
         more = ", which browsers do not play (for H.264: pip install 'visdom-plugin[video]')"
         size = f"{int(cameras.width[0])} x {int(cameras.height[0])}"
-        say(f"{count_of(len(cameras), 'frame')} of {size}, codec {codec}" + more * (codec == "mp4v"))
+        lasts = f"{len(cameras) / fps:.1f} s of video"
+        say(f"{count_of(len(cameras), 'frame')} of {size}, {lasts}, codec {codec}" + more * (codec == "mp4v"))
     if not options.quiet:
         sys.stdout.write("".join(f"{target}\n" for target in targets.values()))
+
+
+def _choose_size(options: Options, subject: Subject, cameras: Cameras) -> tuple[int | None, int | None]:
+    """Width and height as asked for; where nobody asks, those of a first look, of which the other follows."""
+    from visdom_plugin import registry
+
+    if (options.width, options.height) != (None, None) or options.path not in ("orbit", "between"):
+        return options.width, options.height
+    method = subject.record.get("method") if subject.record else None
+    splats = method is None or registry.find(method).hook == "gaussian"
+    least, most = SPLATS_PX if splats else FIELDS_PX
+    width, height = int(cameras.width[0]), int(cameras.height[0])
+    side = min(max(width, height, least), most)
+    return (side, None) if width >= height else (None, side)
 
 
 def _check(options: Options) -> Options:
