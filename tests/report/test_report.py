@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests import browser
+from tests.training import fake
 from visdom_plugin.cli.commands import report, train
 from visdom_plugin.cli.output.reports import repeat_command
 from visdom_plugin.figures.contact_sheet import colour_depth
@@ -68,6 +69,21 @@ def test_no_report_leaves_it_out_and_it_can_be_made_later(fakes, capsys):
     (run / "run.json").write_text(json.dumps(record))
     assert report.main([str(run), "--quiet"]) == 0
     assert (run / "report" / "data.json").stat().st_mtime_ns > drawn
+
+
+def test_what_a_method_says_of_its_steps_is_marked_in_the_curve(fakes, monkeypatch):
+    events = {"opacities reset": [5, 10], "nothing": [], "last Gaussians added": [15]}
+    monkeypatch.setattr(fake.FakeMethod, "events", lambda self: events, raising=False)
+    run = finish()
+    assert json.loads((run / "run.json").read_text())["events"] == events
+    text = (run / "report.html").read_text(encoding="utf-8")
+    assert "Dotted: opacities reset after step 5, 10; last Gaussians added after step 15." in text
+    curves = text[text.index('id="curves"') :]
+    assert curves.count("<title>opacities reset</title>") == 2 and "nothing" not in curves
+    record = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps(record | {"events": {}}))
+    assert report.main([str(run), "--quiet"]) == 0
+    assert "Dotted" not in (run / "report.html").read_text(encoding="utf-8")
 
 
 def test_two_runs_stand_side_by_side(fakes):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from visdom_plugin.atomic_files import write_bytes
+from visdom_plugin.errors import list_some
 from visdom_plugin.report.gather import DATA, FOLDER, state_of
 from visdom_plugin.tables.report.svg_figures import draw_curves, pen, read_curve
 from visdom_plugin.training.runs.run_directory import read_record
@@ -75,6 +76,7 @@ def to_html(runs: Sequence[Reported], folder: Path) -> str:
     from markupsafe import Markup
 
     series = [(n, r.label, c) for n, r in enumerate(runs) if (c := read_curve(r.path)) is not None]
+    marks = _marks(runs)
     scenes = sorted({run.record["scene"] for run in runs})
     title = (
         f"{runs[0].label} on {scenes[0]}" if len(runs) == 1 else f"{len(runs)} runs on {', '.join(scenes)}"
@@ -84,10 +86,33 @@ def to_html(runs: Sequence[Reported], folder: Path) -> str:
         runs=[_run(n, run, folder) for n, run in enumerate(runs)],
         metrics=_metrics(runs),
         places=_places(runs),
-        curves=Markup(draw_curves(series)) if series else "",
+        curves=Markup(draw_curves(series, marks)) if series else "",
+        marked=_describe_marks(runs),
         several=len(runs) > 1,
         same_data=_same_data(runs),
     )
+
+
+def _marks(runs: Sequence[Reported]) -> dict[str, list[float]]:
+    """What happened at which shares of the schedule, where it is one for all runs."""
+    found = []
+    for run in runs:
+        total = run.record["config"].get("steps")
+        events = run.record.get("events", {}) if total else {}
+        found.append({what: [step / total for step in steps] for what, steps in events.items() if steps})
+    return found[0] if found and all(marks == found[0] for marks in found) else {}
+
+
+def _describe_marks(runs: Sequence[Reported]) -> str:
+    """The sentence below the curves; empty where nothing is marked."""
+    if not _marks(runs):
+        return ""
+    events = runs[0].record["events"]
+    listed = "; ".join(f"{what} after step {list_some(steps, 8)}" for what, steps in events.items() if steps)
+    more = " A reset of opacities costs several decibels, which the next steps win back." * (
+        "opacities reset" in events
+    )
+    return f"Dotted: {listed}.{more}"
 
 
 @lru_cache(maxsize=1)

@@ -97,7 +97,8 @@ class Method(Protocol):
     from outside, such as packages and weights; it raises a PluginError that says what is missing.
 
     A method with a `summary() -> dict[str, int]` has these numbers, {"gaussians": 6000}, shown while it trains
-    and noted in run.json's `model`.
+    and noted in run.json's `model`. One with an `events() -> dict[str, list[int]]`, such as {"opacities reset":
+    [120, 240]}, has these steps, counted from 1, marked in the training curve; run.json has them as `events`.
 
     Fields of the config that have a meaning here: `mask_weight`, the weight of the silhouette loss; `hull`, what
     to carve; `vd`, the hook's settings. `visdom_plugin.specs.MethodSpec` adds them where a config lacks them.

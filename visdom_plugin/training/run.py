@@ -28,7 +28,7 @@ from visdom_plugin.training.runs import checkpoints
 from visdom_plugin.training.runs.config_io import as_plain, differences
 from visdom_plugin.training.runs.run_directory import Record, RunDir, describe_data, find_versions
 from visdom_plugin.training.runs.saved_hulls import REFERENCE, find_hull, read_hull, write_hull
-from visdom_plugin.training.trainer import Trainer, summarise, view_psnr
+from visdom_plugin.training.trainer import Trainer, events_of, summarise, view_psnr
 from visdom_plugin.training.training_views import draw_training_views, refuse_empty
 
 log = logging.getLogger(__name__)
@@ -220,6 +220,7 @@ def _run(
         timing={"hull_s": hull_s, "train_s": trainer.train_s, "eval_s": eval_s, "step_ms": step_ms},
         metrics=finite(found),
         model=summarise(method),
+        events=events_of(method),
     )
     return trainer.resumed_from, method, hull
 

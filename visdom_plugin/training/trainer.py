@@ -175,6 +175,11 @@ def summarise(method: Method) -> dict[str, int]:
     return getattr(method, "summary", dict)()
 
 
+def events_of(method: Method) -> dict[str, list[int]]:
+    """What a method marks in its training curve, see `protocols.Method`; nothing where it has no `events`."""
+    return getattr(method, "events", dict)()
+
+
 def _check_output(output: object, method: Method) -> StepOutput:
     if isinstance(output, StepOutput):
         return output

@@ -74,6 +74,10 @@ class Watcher:
         return torch.arange(len(gaussians.means)) < self.remove if self.remove else None
 
 
+def test_events_are_those_of_both_sets(scene, hull):
+    assert start(scene, hull).events()["opacities reset"] == [31, 51]
+
+
 def test_it_learns(scene, hull):
     # Without the opacity reset, whose dip sixty steps do not make up for.
     method = start(scene, hull, replace(SMALL, opacity_reset_every=0))

@@ -57,6 +57,18 @@ def test_it_learns(scene, hull):
     assert (after - truth).square().mean() < 0.7 * (before - truth).square().mean()
 
 
+def test_events_are_the_steps_at_which_the_set_changes(scene, hull):
+    method = start(scene, hull)
+    assert method.events() == {"opacities reset": [40], "last Gaussians added": [40]}
+    advance(method, scene, range(39))
+    assert method.splats.gaussians().opacity_logits.sigmoid().max() > 0.1
+    advance(method, scene, range(39, 40))
+    assert method.splats.gaussians().opacity_logits.sigmoid().max() < 0.02
+    late = replace(SMALL, densify_until=55)
+    assert start(scene, hull, late).events()["last Gaussians added"] == [50]
+    assert "opacities reset" not in start(scene, hull, replace(SMALL, opacity_reset_every=0)).events()
+
+
 def test_a_resumed_run_equals_the_uninterrupted_one(scene, hull):
     straight = start(scene, hull)
     advance(straight, scene, range(33))

@@ -103,6 +103,10 @@ class CorgsLite(SplatMethod[CorgsConfig]):
             strategy.after_step(self.hooks, step)
         self.step_correction(step)
 
+    def events(self) -> dict[str, list[int]]:
+        """See `Strategy.events`; the same for both sets."""
+        return self.strategies[0].events()
+
     def _co_prune(self, done: int) -> None:
         first, second = (one.gaussians().means for one in self.sets)
         gone = unmatched(first, second, self.co_prune_distance)

@@ -69,6 +69,10 @@ class OneSetMethod(SplatMethod[Config]):
         self.strategy.after_step(self.hooks, step)
         self.step_correction(step)
 
+    def events(self) -> dict[str, list[int]]:
+        """See `Strategy.events`."""
+        return self.strategy.events()
+
     def state_dict(self) -> dict[str, Tensor]:
         return self.strategy.state_dict() | self.correction_state()
 

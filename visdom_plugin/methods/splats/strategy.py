@@ -93,6 +93,14 @@ class Strategy:
         self._removed: Counter[str] = Counter()
         self._most, self._warned = len(splats), False
 
+    def events(self) -> dict[str, list[int]]:
+        """What shows in the training curve, and the steps, counted from 1, after which it happens."""
+        found = {
+            "opacities reset": list(self.schedule.reset_opacity),
+            "last Gaussians added": list(self.densify_steps[-1:]),
+        }
+        return {what: steps for what, steps in found.items() if steps}
+
     def sh_degree(self, step: int) -> int:
         """Degree of the spherical harmonics in use: training starts at 0."""
         return min(self.splats.config.sh_degree, step // self.splats.config.sh_every)

@@ -6,7 +6,7 @@ Colours of middle brightness, so that they show on light and dark pages; the pag
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -73,11 +73,14 @@ def average_curves(curves: Sequence[np.ndarray]) -> np.ndarray:
     return np.stack([at, np.mean([np.interp(at, c[:, 0], c[:, 1]) for c in curves], axis=0)], axis=1)
 
 
-def draw_curves(series: Sequence[tuple[int, str, np.ndarray]]) -> str:
+def draw_curves(
+    series: Sequence[tuple[int, str, np.ndarray]], marks: Mapping[str, Sequence[float]] | None = None
+) -> str:
     """Training PSNR over the share of each method's schedule.
 
     Args:
         series: colour number, label and (n, 2) curve of each line.
+        marks: what happened at which shares of the schedule; a dotted line each, the first with its name.
     """
     with drawing():
         figure, axes = _make_axes(_HEIGHT, left=46, grid="y")
@@ -85,6 +88,15 @@ def draw_curves(series: Sequence[tuple[int, str, np.ndarray]]) -> str:
             colour, dash = pen(number)
             (line,) = axes.plot(*curve.T, color=colour, linestyle=dash, linewidth=2, clip_on=False)
             line.set_gid(TIP + printable(label))
+        for what, shares in (marks or {}).items():
+            for share in shares:
+                line = axes.axvline(share, color=_MEAN, linestyle="dotted", linewidth=1)
+                line.set_gid(TIP + printable(what))
+            place = axes.get_xaxis_transform()
+            text = f" {printable(what)}"
+            axes.text(
+                shares[0], 0.02, text, transform=place, rotation=90, fontsize=9, color=_MEAN, ha="right"
+            )
         axes.set_xlim(0, 1)
         axes.set_xticks([0, 0.5, 1], ["0%", "50%", "100%"])
         return to_svg(figure, "training PSNR over the share of the schedule")
