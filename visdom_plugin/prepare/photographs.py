@@ -112,7 +112,7 @@ def _list(folder: Path) -> tuple[Path, list[Path]]:
 
 def _folders_of_photographs(base: Path) -> dict[Path, int]:
     """Folders up to two levels below that hold images, with how many; most first, and masks last."""
-    found = {}
+    found: dict[Path, int] = {}
     for folder in (*base.glob("*"), *base.glob("*/*")):
         if folder.is_dir() and not folder.name.startswith("."):
             with suppress(OSError):
