@@ -32,7 +32,8 @@ COMMANDS = {
 """Commands in the order of use, with words that have options of their own."""
 HEAD = """# Commands
 
-Made from the output of `COMMAND --help`. `{None}|X` means that an option takes X and is unset by default.
+For those who look up an option: every command, with an example and all its options, as `COMMAND --help` prints
+them. `{None}|X` means that an option takes X and is unset by default.
 """
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import commands
 import messages
 import root_pages
@@ -31,7 +33,10 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return text
     page.meta["hide"] = ["toc"]
     head, first, rest = text.partition("\n## ")
-    return f"{head}\n[TOC]\n{first}{rest}".replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")
+    made = f"{head}\n[TOC]\n{first}{rest}".replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")
+    return re.sub(
+        r"^\|.*", lambda row: re.sub(r"(\de-)(\d)", "\\1\N{WORD JOINER}\\2", row[0]), made, flags=re.M
+    )
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:

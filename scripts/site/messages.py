@@ -35,9 +35,9 @@ SUBJECTS = {
 }
 HEAD = """# All messages
 
-Every error message of the commands and the library, read from the source. `...` stands for a value that is filled
-in. A message also says where it was found, the likely cause, and what to do.
-[Troubleshooting](guide/troubleshooting.md) says more about the frequent ones.
+For those who search the words of an error: every message of the commands and the library, read from the source,
+and what to do. `...` stands for a value that is filled in. [Troubleshooting](guide/troubleshooting.md) says more
+about the frequent ones.
 """
 
 

@@ -133,10 +133,11 @@ def test_pages_of_wide_tables_have_their_contents_in_the_text_and_room_beside_it
     def page(place):
         return SimpleNamespace(file=SimpleNamespace(src_uri=place, generated_by=None), meta={})
 
-    text = "# A\n\nOne.\n\n## B\n\n| 1 ± 2 |\n"
+    text = "# A\n\nOne.\n\n## B\n\n| 1 ± 2 | 3e-04 |\n"
     wide, narrow = page("findings/hull.md"), page("guide/choosing.md")
     made = hook.on_page_markdown(text, wide, None, None)
-    assert made == "# A\n\nOne.\n\n[TOC]\n\n## B\n\n| 1\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}2 |\n"
+    row = "| 1\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}2 | 3e-\N{WORD JOINER}04 |"
+    assert made == f"# A\n\nOne.\n\n[TOC]\n\n## B\n\n{row}\n"
     assert wide.meta == {"hide": ["toc"]}
     assert hook.on_page_content("x", wide, None, None) == '<div class="measured">x</div>'
     assert ".measured" in (ROOT / "docs/assets/site.css").read_text(encoding="utf-8")
