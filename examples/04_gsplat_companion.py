@@ -1,6 +1,6 @@
 """A companion of gsplat's DefaultStrategy: four lines more in a trainer like gsplat's simple_trainer.py.
 
-Needs gsplat (`pip install "visdom-plugin[cuda]"`). Here this package's rasteriser draws, so no GPU is
+Needs gsplat (`pip install -e ".[cuda]"`). Here this package's rasteriser draws, so no GPU is
 needed. On CUDA leave `render` out, and gsplat's rasteriser draws.
 
     python examples/04_gsplat_companion.py

@@ -1,6 +1,6 @@
 """nerfacc's occupancy grid with cells that the hull closes, and rays that end at the hull.
 
-Needs nerfacc 0.5.3 (`pip install "visdom-plugin[nerfacc]"`). nerfacc samples with CUDA kernels only: without a GPU
+Needs nerfacc 0.5.3 (`pip install -e ".[nerfacc]"`). nerfacc samples with CUDA kernels only: without a GPU
 the rays are sampled evenly between their limits.
 
     python examples/05_nerfacc_estimator.py
