@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ from visdom_plugin.cli.commands import check as check_command
 from visdom_plugin.cli.commands.prepare import main
 from visdom_plugin.cli.commands.train import main as train
 from visdom_plugin.geometry.cameras import Cameras, project
-from visdom_plugin.prepare import write
+from visdom_plugin.hull.checks.mask_checks import border_contact, object_length
+from visdom_plugin.prepare import demo, write
 from visdom_plugin.prepare.demo import true_mask
 from visdom_plugin.prepare.placed import turn_upright
 
@@ -204,3 +206,18 @@ def test_colmap_places_a_dozen(tmp_path):
     )
     ratio = apart / real
     assert ratio.std() / ratio.mean() < 0.03
+
+
+def test_the_object_fills_the_frames_of_the_demo_and_is_whole(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(demo, "write_demo", lambda folder, config, board: asked.append(config) or [])
+    assert main(["--demo", str(tmp_path / "photographs"), "--quiet"]) == 0
+    monkeypatch.undo()
+    (config,) = asked
+    config = replace(config, size=(160, 120), samples=1)
+    lengths = []
+    for truth in demo.write_demo(tmp_path / "small", config):
+        mask = true_mask(truth, truth.size, config.radial)
+        assert not border_contact(mask)
+        lengths.append(object_length(mask) / min(truth.size))
+    assert len(lengths) == 12 and min(lengths) > 0.35 and np.mean(lengths) > 0.5

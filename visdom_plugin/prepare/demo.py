@@ -28,7 +28,8 @@ _MIDDLE = np.array([0.13, 0.0, 0.0])
 _TEXTURE_PX = 24
 """Texture pixels along a square of the board."""
 _PAPER_MM = 8.0
-_FOCAL_35 = 26.0
+FILLING = 40.0
+"""A 35 mm equivalent with which the object fills the frame, and enough of the board is left."""
 _WOOD, _WALL, _PAPER = (
     np.array(c, np.float32) for c in ((0.52, 0.36, 0.24), (0.6, 0.65, 0.67), (1, 0.98, 0.95))
 )
@@ -42,6 +43,8 @@ class DemoConfig:
     views: int = 12
     size: tuple[int, int] = (1600, 1200)
     """Long and short side in pixels."""
+    focal_35: float = 26.0
+    """35 mm equivalent of the focal length: of a phone's main lens. More of them brings the object closer."""
     focal_error: float = 0.04
     """By how much EXIF's focal length is too large, as a share."""
     radial: tuple[float, float] = (0.08, -0.12)
@@ -83,7 +86,7 @@ def _write_view(folder: Path, config: DemoConfig, board: BoardSettings, texture:
     upright = config.portrait and i % 3 == 2
     size = config.size[::-1] if upright else config.size
     truth = Truth(
-        f"IMG_{i + 1:04d}.jpg", _pose(i, config.views), _FOCAL_35 / _DIAGONAL * math.hypot(*size), size
+        f"IMG_{i + 1:04d}.jpg", _pose(i, config.views), config.focal_35 / _DIAGONAL * math.hypot(*size), size
     )
     picture = _photograph(truth, config, board, texture, i)
     if upright:
@@ -210,7 +213,7 @@ def _jpeg(picture: np.ndarray, orientation: int, config: DemoConfig) -> bytes:
     if config.exif:
         exif[0x010F], exif[0x0110] = "visdom", "demo phone"
         inner = exif.get_ifd(0x8769)
-        inner[0x920A], inner[0xA405] = 5.7, round(_FOCAL_35 * (1 + config.focal_error))
+        inner[0x920A], inner[0xA405] = 5.7, round(config.focal_35 * (1 + config.focal_error))
     data = io.BytesIO()
     Image.fromarray(picture).save(data, "JPEG", quality=93, exif=exif)
     return data.getvalue()

@@ -145,7 +145,7 @@ def _print_board(options: Options, board: BoardSettings) -> None:
 
 def _write_demo(options: Options, board: BoardSettings) -> None:
     load_torch()
-    from visdom_plugin.prepare.demo import DemoConfig, write_demo
+    from visdom_plugin.prepare.demo import FILLING, DemoConfig, write_demo
 
     assert options.demo is not None
     if options.demo.exists() and (not options.demo.is_dir() or any(options.demo.iterdir())):
@@ -153,7 +153,7 @@ def _write_demo(options: Options, board: BoardSettings) -> None:
             "there is something of this name", where=f"--demo {options.demo}", todo="name a new folder"
         )
     board.check()
-    truths = write_demo(options.demo, DemoConfig(), board)
+    truths = write_demo(options.demo, DemoConfig(focal_35=FILLING), board)
     if not options.quiet:
         sys.stdout.write(
             f"{len(truths)} photographs in {options.demo}; next: visdom-prepare {options.demo}\n"
