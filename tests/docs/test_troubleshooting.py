@@ -19,17 +19,40 @@ BESIDE = ("mask", "disk")
 """What commands say that is neither: a mask that cannot be read, in the check's table, and a full disk."""
 
 
-def used() -> set[str]:
+SOURCES = {
+    path: path.read_text(encoding="utf-8")
+    for package in ("visdom_plugin", "datamodules", "method_configs")
+    for path in sorted((ROOT / package).rglob("*.py"))
+}
+
+
+def values(node: ast.expr) -> set[str]:
+    """What an expression may be, as far as it is spelled out: a string, or the two of a condition."""
+    if isinstance(node, ast.IfExp):
+        return values(node.body) | values(node.orelse)
+    return {node.value} if isinstance(node, ast.Constant) and node.value is not None else set()
+
+
+def used(sources=SOURCES) -> set[str]:
     """Topics of errors, and kinds of findings, in the source."""
     found = set()
-    for package in ("visdom_plugin", "datamodules", "method_configs"):
-        for path in (ROOT / package).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.keyword) and node.arg == "topic":
-                    found |= {node.value.value} if isinstance(node.value, ast.Constant) else set()
-                if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Finding", "Suspicion"):
-                    found |= {node.args[0].value} if isinstance(node.args[0], ast.Constant) else set()
+    for text in sources.values():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.keyword) and node.arg == "topic":
+                found |= values(node.value)
+            if isinstance(node, ast.AnnAssign) and getattr(node.target, "id", "") == "usual" and node.value:
+                found |= values(node.value)
+            if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "usual":
+                found |= values(node.value)
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Finding", "Suspicion"):
+                found |= values(node.args[0])
     return found
+
+
+def named(sources=SOURCES) -> set[str]:
+    """Headings of the page that the source names outright."""
+    pattern = re.compile(r"""say_more\(["']([\w-]+)["']\)|PAGE\}#([\w-]+)""")
+    return {a or b for text in sources.values() for a, b in pattern.findall(text)}
 
 
 def test_every_name_has_a_section_and_every_section_a_name():
@@ -39,9 +62,18 @@ def test_every_name_has_a_section_and_every_section_a_name():
 
 
 def test_names_in_the_source_are_registered_and_those_registered_are_used():
-    usual = {kind.usual for kind in errors.VisDomError.__subclasses__()}
     assert used() <= {*errors.TOPICS, *KINDS}
-    assert set(errors.TOPICS) <= used() | usual
+    assert set(errors.TOPICS) <= used()
+
+
+def test_every_place_that_a_message_ends_with_is_a_heading():
+    assert {"findings", "disk"} <= named() <= anchors(PAGE)
+
+
+def test_names_in_conditions_and_classes_are_seen():
+    text = 'class E:\n    usual = "a"\n    usual: str = "b"\nE(topic="c" if x else "d" if y else None)\n'
+    text += 'Finding("e" if x else "f")\nsay(f"{PAGE}#g" + say_more("h"))\n'
+    assert used({0: text}) == set("abcdef") and named({0: text}) == {"g", "h"}
 
 
 @pytest.mark.parametrize("kind", KINDS)
