@@ -241,8 +241,10 @@ def run(begin, end, numbers, sizes, parameters, x, extra, out, g_out, g_x, g_sum
     places = np.empty((layers + 1, 8), np.int64)
     zeros = _lay_out(sizes, again, biased, places)
     above, below, to_input = zeros + STRIDE, zeros + (1 + TILE) * STRIDE, zeros + (1 + 2 * TILE) * STRIDE
-    room = np.zeros(to_input + TILE * STRIDE + LANES, np.float32)
+    room = np.empty(to_input + TILE * STRIDE + LANES, np.float32)
     room = room[-(room.ctypes.data // 4) % LANES :]  # vectors begin where lines of the cache do
+    for i in range(len(room)):
+        room[i] = 0
     unbound = np.float32(-np.inf)
     for layer in range(layers):
         inputs, outputs, at = sizes[layer, 0], sizes[layer, 1], places[layer, 1]
@@ -254,7 +256,9 @@ def run(begin, end, numbers, sizes, parameters, x, extra, out, g_out, g_x, g_sum
             _copy(one, outputs, parameters, at + inputs * outputs, zero, room, places[layer, 3], zero)
     for piece in range(begin, end):
         for layer in range(layers if back else zero):
-            room[places[layer, 5] : places[layer, 7]] = 0
+            gradients = room[places[layer, 5] : places[layer, 7]]
+            for i in range(len(gradients)):
+                gradients[i] = 0
         for first in range(piece * PIECE, min((piece + 1) * PIECE, points), TILE):
             count, at = min(zero + TILE, points - first), places[0, 7]
             _copy(count, width, x, first * x_row + lead, x_row, room, at, stride)

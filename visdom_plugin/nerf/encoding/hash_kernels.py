@@ -235,7 +235,9 @@ def encode(
     groups_per_block = BLOCK // samples
     blocks = (groups + groups_per_block - 1) // groups_per_block
     rows, weights = np.empty(8 * PLANE, np.uint32), np.empty(8 * PLANE, np.float32)
-    strengths = np.ones(BLOCK, np.float32)
+    strengths = np.empty(BLOCK, np.float32)
+    for p in range(BLOCK):
+        strengths[p] = 1
     share = np.float32(1) / np.float32(samples)
     stride = levels * features
     for item in range(begin, end):
@@ -278,12 +280,15 @@ def encode_backward(
     groups = len(points) // (3 * samples)
     groups_per_block = BLOCK // samples
     rows, weights = np.empty(8 * PLANE, np.uint32), np.empty(8 * PLANE, np.float32)
-    strengths = np.ones(BLOCK, np.float32)
+    strengths = np.empty(BLOCK, np.float32)
+    for p in range(BLOCK):
+        strengths[p] = 1
     share = np.float32(1) / np.float32(samples)
     stride = levels * features
     for item in range(begin, end):
         level = levels - 1 - item
-        g_table[offsets[level] * features : offsets[level + 1] * features] = np.float32(0)
+        for i in range(U(offsets[level] * features), U(offsets[level + 1] * features)):
+            g_table[i] = 0
         for first in range(0, groups, groups_per_block):
             count = min(groups_per_block, groups - first)
             if len(scales):
