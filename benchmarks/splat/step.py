@@ -3,8 +3,8 @@
 
     python benchmarks/splat/step.py [--repeats 15] [--sizes 200000x800]
 
-A step is forward, 0.8 L1 + 0.2 (1 - SSIM), backward, and torch's fused Adam over all parameters, harmonics of
-degree 3. The Gaussians cover a sphere that fills most of the image. Times are the least of the repeats.
+A step is forward, 0.8 L1 + 0.2 (1 - SSIM), backward, and Adam over all parameters, harmonics of degree 3. The
+Gaussians cover a sphere that fills most of the image. Times are the least of the repeats.
 
 The dense reference holds every (Gaussian, pixel) pair in memory, so it is measured at a small size; its time
 grows with the number of pairs, and the last column states what that makes of it at the row's size.
@@ -31,6 +31,7 @@ from visdom_plugin.geometry.rotations import matrix_from_quaternion
 from visdom_plugin.losses import photometric_loss
 from visdom_plugin.splat.cpu.backend import warm_up
 from visdom_plugin.splat.gaussians import Gaussians
+from visdom_plugin.splat.optimiser import GaussianOptimiser
 from visdom_plugin.splat.rasterise import rasterise
 from visdom_plugin.ssim import _ssim_by_convolution
 
@@ -97,22 +98,20 @@ def time_step(n: int, size: int, repeats: int, reference: bool) -> list[float]:
             return dense(gaussians, camera, background)
         return rasterise(gaussians, camera, background, near=0.01).rgb
 
-    gaussians = sphere(n, 0)
-    parameters = [p.requires_grad_() for p in gaussians.tensors().values()]
-    adam = torch.optim.Adam(parameters, lr=1e-4, eps=1e-15, fused=True)
+    start = sphere(n, 0).tensors()
+    optimiser = GaussianOptimiser(start, dict.fromkeys(start, 1e-4))
     with torch.no_grad():
         target = draw(sphere(n, 1))
     best = [math.inf] * (len(PARTS) + 1)
     for _ in range(repeats):
         at = [time.perf_counter()]
-        rgb = draw(gaussians)
+        rgb = draw(Gaussians(**optimiser.parameters))
         at.append(time.perf_counter())
         loss = compare(rgb, target)
         at.append(time.perf_counter())
         loss.backward()
         at.append(time.perf_counter())
-        adam.step()
-        adam.zero_grad()
+        optimiser.step()
         at.append(time.perf_counter())
         spans = [1e3 * (b - a) for a, b in itertools.pairwise(at)] + [1e3 * (at[-1] - at[0])]
         best = [min(b, s) for b, s in zip(best, spans, strict=True)]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from itertools import pairwise
 from queue import SimpleQueue
@@ -66,16 +66,27 @@ def parallel_for(kernel, count: int, grain: int, *arguments) -> None:
     Pieces go to whichever thread is free, so a kernel must write only what belongs to its own items; then the
     result does not depend on the number of threads, which is torch's (`torch.set_num_threads`).
     """
-    workers = min(torch.get_num_threads(), -(-count // grain))
+    parallel_for_each(kernel, grain, [(count, arguments)])
+
+
+def parallel_for_each(kernel, grain: int, runs: Sequence[tuple[int, tuple]]) -> None:
+    """The same for several runs, each a count and arguments, in one launch; they, too, write apart."""
+    workers = min(torch.get_num_threads(), sum(-(-count // grain) for count, _ in runs))
     if workers <= 1:
-        if count:
-            kernel(0, count, *arguments)
+        for count, arguments in runs:
+            if count:
+                kernel(0, count, *arguments)
         return
-    pieces = iter(list(pairwise(_starts(count, grain, workers))))  # its next() is atomic in CPython
+    listed = [
+        (begin, end, *arguments)
+        for count, arguments in runs
+        for begin, end in pairwise(_starts(count, grain, workers))
+    ]
+    pieces = iter(listed)  # its next() is atomic in CPython
 
     def work() -> None:
-        for begin, end in pieces:
-            kernel(begin, end, *arguments)
+        for piece in pieces:
+            kernel(*piece)
 
     jobs, done = _jobs(workers - 1), Done()
     for _ in range(workers - 1):

@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from visdom_plugin.splat.cpu import adam
+
+BETAS = 0.9, 0.999
+EPSILON = 1e-15
+"""3DGS's: gradients of single Gaussians are far below Adam's usual 1e-8."""
+SLOW = 1 / 20
+"""Of their learning rate, at which harmonics behind the constant learn (3DGS)."""
+
+
+@dataclass
+class Moments:
+    """What Adam keeps of a parameter."""
+
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    steps: int = 0
+
 
 class GaussianOptimiser:
-    """One Adam over named per-Gaussian parameters whose first dimension is the Gaussian.
+    """Adam over named per-Gaussian parameters whose first dimension is the Gaussian.
 
-    Harmonics "sh" (N, B, 3) learn at two rates: those behind the constant at a twentieth (3DGS). Adam has one rate
-    for a tensor, so it holds them, and the state names them, as sh_dc and sh_rest.
+    Harmonics "sh" (N, B, 3) learn at two rates: those behind the constant at a twentieth (3DGS). The state names
+    the two parts sh_dc and sh_rest.
 
     Args:
         parameters: tensors (N, ...) by name.
@@ -20,37 +39,44 @@ class GaussianOptimiser:
     """
 
     parameters: dict[str, torch.nn.Parameter]
-    """By name; new ones after every call that changes them."""
+    """By name; a step changes them in place, and new ones are there after any other change."""
 
     def __init__(self, parameters: Mapping[str, Tensor], learning_rates: Mapping[str, float]):
-        rates = dict(learning_rates)
-        if "sh" in rates:
-            rates |= {"sh_dc": rates["sh"], "sh_rest": rates["sh"] / 20}
-        groups = [
-            {"params": [torch.nn.Parameter(p.detach().clone().contiguous())], "lr": rates[name], "name": name}
-            for name, p in _split(parameters).items()
-        ]
-        # 3DGS's epsilon: gradients of single Gaussians are far below Adam's default 1e-8.
-        self.adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        self._join()
+        self.rates = {name: learning_rates[name] for name in parameters}
+        self.parameters = {
+            n: torch.nn.Parameter(p.detach().clone().contiguous()) for n, p in parameters.items()
+        }
+        self._moments: dict[str, Moments] = {}
 
     def __len__(self) -> int:
         return next(iter(self.parameters.values())).shape[0]
 
     def set_learning_rate(self, name: str, value: float) -> None:
-        for group in self.adam.param_groups:
-            if group["name"] == name:
-                group["lr"] = value
+        self.rates[name] = value
 
+    @torch.no_grad()
     def step(self) -> None:
         """One Adam step; gradients are dropped afterwards."""
-        gradients = _split({n: p.grad for n, p in self.parameters.items() if p.grad is not None})
-        for group in self.adam.param_groups:
-            gradient = gradients.get(group["name"])
-            group["params"][0].grad = None if gradient is None else gradient.contiguous()
-        self.adam.step()
-        self.adam.zero_grad(set_to_none=True)
-        self._join()
+        updates = []
+        for name, parameter in self.parameters.items():
+            if parameter.grad is None:
+                continue
+            if name not in self._moments:
+                self._moments[name] = Moments(torch.zeros_like(parameter), torch.zeros_like(parameter))
+            moments = self._moments[name]
+            moments.steps += 1
+            first, second = (1 - beta**moments.steps for beta in BETAS)
+            tensors = parameter.detach(), parameter.grad.contiguous(), moments.exp_avg, moments.exp_avg_sq
+            rate, root = self.rates[name] / first, math.sqrt(second)
+            if parameter.device.type == "cpu" and parameter.dtype == torch.float32:
+                row = math.prod(parameter.shape[1:])
+                shares = adam.repeat(3 if name == "sh" else row, row, SLOW)
+                p, g, m, v = (t.view(-1).numpy() for t in tensors)
+                updates.append(adam.Update(p, g, m, v, shares, rate, root))
+            else:
+                update_by_torch(*tensors, rate, root, harmonics=name == "sh")
+            parameter.grad = None
+        adam.update(updates, BETAS, EPSILON)
 
     def keep(self, kept: Tensor) -> None:
         """Keeps the Gaussians where `kept` (N,) bool is True."""
@@ -58,7 +84,6 @@ class GaussianOptimiser:
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Adds Gaussians at the end; their moments start at zero."""
-        rows = _split(rows)
         self._replace(
             lambda name, x: torch.cat([x, rows[name].to(x)]),
             lambda name, x: torch.cat([x, torch.zeros_like(rows[name]).to(x)]),
@@ -71,53 +96,69 @@ class GaussianOptimiser:
             lambda n, x: torch.zeros_like(x) if n == name else x,
         )
 
-    def _replace(self, change, change_moments=None) -> None:
+    @torch.no_grad()
+    def _replace(
+        self,
+        change: Callable[[str, Tensor], Tensor],
+        change_moments: Callable[[str, Tensor], Tensor] | None = None,
+    ) -> None:
         change_moments = change_moments or change
-        for group in self.adam.param_groups:
-            name, old = group["name"], group["params"][0]
-            new = torch.nn.Parameter(change(name, old.detach()).contiguous())
-            state = self.adam.state.pop(old, None)
-            if state:
-                for key in ("exp_avg", "exp_avg_sq"):
-                    state[key] = change_moments(name, state[key]).contiguous()
-                self.adam.state[new] = state
-            group["params"] = [new]
-        self._join()
-
-    def _join(self) -> None:
-        parts = {group["name"]: group["params"][0] for group in self.adam.param_groups}
-        if "sh_dc" in parts:
-            joined = torch.cat([parts.pop("sh_dc").detach(), parts.pop("sh_rest").detach()], 1)
-            parts["sh"] = torch.nn.Parameter(joined)
-        self.parameters = parts
+        for name, old in self.parameters.items():
+            self.parameters[name] = torch.nn.Parameter(change(name, old.detach()).contiguous())
+        for name, m in self._moments.items():
+            m.exp_avg, m.exp_avg_sq = (
+                change_moments(name, x).contiguous() for x in (m.exp_avg, m.exp_avg_sq)
+            )
 
     def state_dict(self) -> dict[str, Tensor]:
         """Parameters, moments and step counts as a flat dict of tensors."""
-        out = {}
-        for group in self.adam.param_groups:
-            name, parameter = group["name"], group["params"][0]
-            out[name] = parameter.detach()
-            for key, value in self.adam.state.get(parameter, {}).items():
-                out[f"adam.{name}.{key}"] = torch.as_tensor(value)
+        out = _split({name: p.detach() for name, p in self.parameters.items()})
+        for key in ("exp_avg", "exp_avg_sq"):
+            moments = _split({name: getattr(m, key) for name, m in self._moments.items()})
+            out |= {f"adam.{name}.{key}": value for name, value in moments.items()}
+        for name, m in self._moments.items():
+            for part in ("sh_dc", "sh_rest") if name == "sh" else (name,):
+                out[f"adam.{part}.step"] = torch.tensor(float(m.steps))
         return out
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Takes over what `state_dict` gave; the number of Gaussians may differ."""
-        for group in self.adam.param_groups:
-            name = group["name"]
-            self.adam.state.pop(group["params"][0], None)
-            new = torch.nn.Parameter(state[name].to(group["params"][0]).clone())
-            group["params"] = [new]
-            prefix = f"adam.{name}."
-            moments = {k[len(prefix) :]: v.clone() for k, v in state.items() if k.startswith(prefix)}
-            if moments:
-                # The count of steps, too: fused Adam reads it on the device.
-                self.adam.state[new] = {k: v.to(new.device) for k, v in moments.items()}
-        self._join()
+        for name, old in self.parameters.items():
+
+            def read(text: str, name: str = name, like: Tensor = old) -> Tensor:
+                parts = ("sh_dc", "sh_rest") if name == "sh" else (name,)
+                return torch.cat(
+                    [state[text.format(part)].to(like) for part in parts], 1 if len(parts) > 1 else 0
+                )
+
+            self.parameters[name] = torch.nn.Parameter(read("{}"))
+            self._moments.pop(name, None)
+            steps = state.get(f"adam.{'sh_dc' if name == 'sh' else name}.step")
+            if steps is not None:
+                self._moments[name] = Moments(read("adam.{}.exp_avg"), read("adam.{}.exp_avg_sq"), int(steps))
+
+
+def update_by_torch(
+    parameter: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    rate: float,
+    root: float,
+    *,
+    harmonics: bool,
+) -> None:
+    """`adam.update` of one parameter on any device, harmonics (N, B, 3) or not."""
+    mean.lerp_(gradient, 1 - BETAS[0])
+    square.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
+    change = rate * mean / (square.sqrt() / root + EPSILON)
+    if harmonics:
+        change[:, 1:] *= SLOW
+    parameter -= change
 
 
 def _split(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors (N, ...) by name, as Adam holds them."""
+    """Tensors (N, ...) by name, as the state names them."""
     parts = dict(tensors)
     if "sh" in parts:
         sh = parts.pop("sh")

@@ -18,6 +18,7 @@ from visdom_plugin.render import Render
 from visdom_plugin.splat.cpu import blending, projection
 from visdom_plugin.splat.cpu.tiles import Tiles
 from visdom_plugin.splat.gaussians import Gaussians
+from visdom_plugin.splat.optimiser import GaussianOptimiser
 
 GAUSSIANS_PER_PIECE = 1024
 TILES_PER_PIECE = 8
@@ -55,9 +56,11 @@ def warm_up() -> None:
     k = eye.new_tensor([[16, 0, 8], [0, 16, 8], [0, 0, 1]])
     camera = Cameras.from_matrices(k, eye, width=16, height=16)
     shapes = ((1, 3), (1, 3), (1, 4), (1,), (1, 16, 3))
-    gaussians = Gaussians(*(torch.ones(shape, requires_grad=True) for shape in shapes))
-    render = rasterise_cpu(gaussians, camera, torch.ones(3), 3, 0.01)
+    one = Gaussians(*(torch.ones(shape) for shape in shapes)).tensors()
+    optimiser = GaussianOptimiser(one, dict.fromkeys(one, 0.0))
+    render = rasterise_cpu(Gaussians(**optimiser.parameters), camera, torch.ones(3), 3, 0.01)
     (ssim(render.rgb, torch.zeros(16, 16, 3)) + render.depth.sum()).backward()
+    optimiser.step()
 
 
 def _pack(camera: Cameras, near: float) -> np.ndarray:
