@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from visdom_plugin.splat.cpu import adam
+from visdom_plugin.splat import adam
 
 BETAS = 0.9, 0.999
 EPSILON = 1e-15
