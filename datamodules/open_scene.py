@@ -346,7 +346,7 @@ def _doubt_grey(names: Sequence[str], loaded: Sequence[LoadedView]) -> dict[str,
     found = {n: v.grey for n, v in zip(names, loaded, strict=True) if v.masked and v.grey > DOUBTFUL}
     if found:
         log.warning(
-            "%d of %d masks may be none: up to %.0f%% of their pixels are neither black nor white, cut at one "
+            "%d of %d masks are doubtful: up to %.0f%% of their pixels are neither black nor white, cut at one "
             "half; masks are white on the object and black around it",
             len(found),
             len(loaded),

@@ -63,7 +63,7 @@ def refuse_photograph(
         where=path,
         cause=cause,
         todo="save each mask white on the object and black around it, or as a cut-out with an alpha channel; "
-        "--masks FOLDER names their folder. visdom-prepare PHOTOS --poses POSES --out SCENE makes masks",
+        "--masks FOLDER names their folder. visdom-prepare makes masks where it is given none",
         topic="mask-grey",
     )
 

@@ -70,7 +70,7 @@ class VisibleDomain(HullSettings):
         """
         # Settings stand on every command line: torch and numba are loaded when a hull is carved, the check, which
         # needs OpenCV, when it is asked.
-        from visdom_plugin.hull.carving.carve import carve_silhouettes
+        from visdom_plugin.hull.carving.carve import carve_silhouettes, describe_pieces
         from visdom_plugin.hull.carving.keep_rule import describe_rule
         from visdom_plugin.hull.carving.votes import gather_silhouettes
         from visdom_plugin.hull.checks.causes.intrinsics import may_be_other_units
@@ -134,12 +134,11 @@ class VisibleDomain(HullSettings):
                 len(silhouettes),
                 wording().look,
             )
-        made, dropped = hull.summary, hull.summary["components_dropped"]
+        made = hull.summary
         log.info(
-            "hull: %s%s; %d of %s voxels of %.4g; %d of %d separate pieces kept%s; %.2f s",
+            "hull: %s%s; %d of %s voxels of %.4g; %s; %.2f s",
             "" if self.kind == "visdom" else f"{self.kind}, ", describe_rule(made), hull.voxels,
-            "x".join(map(str, hull.shape)), hull.voxel_size, made["components"], made["components_found"],
-            dropped and f" ({dropped})",
+            "x".join(map(str, hull.shape)), hull.voxel_size, describe_pieces(made),
             made["seconds"] + made["bounds_seconds"],
         )  # fmt: skip
         return hull

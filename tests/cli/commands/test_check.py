@@ -93,6 +93,7 @@ def test_masks_that_are_photographs_or_grey_are_findings(folder, tmp_path, capsy
     assert main([str(spoilt), "--json"]) == 1
     (finding,) = json.loads(capsys.readouterr().out)["findings"]
     assert (finding["kind"], finding["sure"]) == ("mask-grey", "certain")
+    assert main([str(spoilt)]) == 1 and "scene: cannot be read, 1 finding" in capsys.readouterr().out
     assert "is a photograph" in finding["what"] and "alpha channel" in finding["todo"]
 
 

@@ -98,9 +98,9 @@ def test_masks_in_one_colour_are_no_photographs(picture):
 
 
 def test_soft_masks_are_warned_of_and_named_by_the_scene(tiny, folder, caplog):
-    assert load(folder).grey_masks == {} and "may be none" not in caplog.text
+    assert load(folder).grey_masks == {} and "doubtful" not in caplog.text
     name = tiny.train.names[1]
     write(folder / f"masks/{name}.png", np.where(tiny.train.masks[1].numpy(), 140, 110).astype(np.uint8))
     scene = load(folder)
     assert scene.grey_masks == {f"{name}.png": 1.0}
-    assert "1 of 4 masks may be none" in caplog.text
+    assert "1 of 4 masks are doubtful" in caplog.text

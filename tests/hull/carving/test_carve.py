@@ -11,7 +11,8 @@ import torch
 from tests.hull.balls import ball_masks, box_masks, moved, ring
 from visdom_plugin.errors import ConfigError, EmptyHullError
 from visdom_plugin.geometry.cameras import rays_of
-from visdom_plugin.hull.carving.keep_rule import KeepRule
+from visdom_plugin.hull.carving.carve import describe_pieces
+from visdom_plugin.hull.carving.keep_rule import KeepRule, as_fraction, describe_rule
 from visdom_plugin.hull.carving.votes import Grid, dense_carve, gather_silhouettes
 from visdom_plugin.hull.checks.check import check
 from visdom_plugin.hull.checks.coverage import measure_coverage
@@ -289,3 +290,15 @@ def test_empty_hull_is_an_error():
     cameras = ring(4)
     with pytest.raises(EmptyHullError):
         SMALL.carve(cameras, [torch.zeros(96, 96, dtype=torch.bool)] * 4)
+
+
+def test_pieces_and_the_rule_are_told_in_words():
+    summary = {"components": 1, "components_found": 1, "components_dropped": ""}
+    assert describe_pieces(summary) == "in one piece"
+    more = {"components": 2, "components_found": 5, "components_dropped": "3 dropped"}
+    assert describe_pieces(more) == "2 of 5 separate pieces kept (3 dropped)"
+    rule = {"kind": "visdom", "k": 3, "agreement_means": KeepRule(4, 3, as_fraction(0.95)).meaning()}
+    said = "inside the masks of all of the views that see it "
+    said += "(the agreement: at least 0.95 of them; 4 views in all)"
+    assert describe_rule(rule) == f"seen by at least 3 views (K = 3), {said}"
+    assert describe_rule(rule | {"kind": "traditional"}) == said

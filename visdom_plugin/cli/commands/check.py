@@ -196,7 +196,7 @@ def doubt_masks(scene: Scene, names: Sequence[str]) -> list[Finding]:
     if not views:
         return []
     shares = [scene.grey_masks[names[i]] for i in views]
-    whose = Name(names).masks_of(views, "may be none", "may be none")
+    whose = Name(names).masks_of(views, "is doubtful", "are doubtful")
     share = spell_range(shares, ".0%")
     what = f"{whose}: {share} of the pixels are neither black nor white; they are cut at one half"
     todo = "look at the files: masks are white on the object and black around it, grey on its outline alone"
@@ -299,6 +299,8 @@ def _table(report: dict[str, Any]) -> None:
     views = count_of(choice["free"] if choice else len(report["views"]), "view")
     if choice:
         views = f"{len(report['views'])} of {views}"
+    elif not report["views"]:
+        views = "cannot be read"
     console.print(f"[bold]{escape(report['scene'])}[/bold]: {views}, {said}")
     if rows:
         table = Table(show_edge=False, pad_edge=False, show_lines=True)

@@ -258,6 +258,7 @@ def _inside_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _table(report: dict[str, Any]) -> str:
+    from visdom_plugin.hull.carving.carve import describe_pieces
     from visdom_plugin.hull.carving.keep_rule import describe_rule
 
     size = " x ".join(f"{b - a:.4g}" for a, b in zip(*report["extent"], strict=True))
@@ -271,11 +272,7 @@ def _table(report: dict[str, Any]) -> str:
         ),
         *_inside_rows(report),
         ("size", f"{size}, volume {report['volume']:.5g}, surface {report['surface_area']:.5g}"),
-        (
-            "pieces",
-            f"{report['components']} of {report['components_found']} separate ones kept"
-            + (f"; {report['components_dropped']}" if report["components_dropped"] else ""),
-        ),
+        ("pieces", describe_pieces(report)),
         ("mesh", "watertight" if report["watertight"] else "not watertight"),
         ("seconds", f"{report['seconds']:.2f}, and {report['bounds_seconds']:.2f} to find the bounds"),
     ]

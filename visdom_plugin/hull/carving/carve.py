@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -152,6 +153,13 @@ def _policy(settings: HullSettings, rule: KeepRule) -> str:
     """The policy on the grid's pieces."""
     baseline = settings.kind == "unit-sphere" or _one_view_is_enough(settings, rule)
     return "drop-small" if settings.components == "explain" and baseline else settings.components
+
+
+def describe_pieces(summary: Mapping[str, Any]) -> str:
+    """How many pieces a hull has, and what became of others, from its summary."""
+    kept, found, dropped = (summary[f"components{of}"] for of in ("", "_found", "_dropped"))
+    said = "in one piece" if found == 1 else f"{kept} of {found} separate pieces kept"
+    return f"{said} ({dropped})" if dropped else said
 
 
 def _say_dropped(sizes: np.ndarray, keep: np.ndarray, policy: str, min_fraction: float) -> str:
