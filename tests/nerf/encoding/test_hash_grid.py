@@ -12,6 +12,7 @@ import torch
 
 from tests.nerf.encoding import hash_twin
 from visdom_plugin.errors import ConfigError
+from visdom_plugin.nerf.encoding import hash_grid
 from visdom_plugin.nerf.encoding.hash_grid import (
     HashLayout,
     default_backend,
@@ -223,9 +224,11 @@ def test_mean_squares_agree_with_torch_on_any_number_of_threads():
     assert mean_square_per_level(table.requires_grad_(), layout).requires_grad
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("used", ["features", "squares", "both"])
-def test_spread_encoding_equals_its_parts(used):
+def test_spread_encoding_equals_its_parts(used, backend, monkeypatch):
     """Features, what levels leave out, and mean squares, with the gradient of the first and the last."""
+    monkeypatch.setattr(hash_grid, "default_backend", lambda device: backend)
     table = table_of(SMALL)
     points, scales = drawn(2, 20, 6, 3), drawn(3, 20, 6, high=0.3) ** 2
     squares = mean_square_per_level(table.detach(), SMALL)
