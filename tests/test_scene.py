@@ -59,8 +59,8 @@ def test_the_summary_tells_the_kinds_apart_and_reads_no_pixels_of_plain_views():
     half = torch.ones(6, 8, dtype=torch.bool).tril(0)
     mixed = make_views(ignore=(None, half, None, None), mask_origins=("given", "given", "hull", "colour"))
     text = "\n".join(describe_masks(mixed))
-    assert "2 foreground" in text and "1 views whose mask is the outline" in text and "colour only" in text
-    assert f"1 views with ignored pixels ({half.float().mean():.1%}" in text
+    assert "2 foreground" in text and "1 view with the outline of" in text and "for colour inside" in text
+    assert f"1 view with ignored pixels ({half.float().mean():.1%}" in text
 
 
 def test_a_scene_is_shown_in_one_line():

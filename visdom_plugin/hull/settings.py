@@ -39,7 +39,7 @@ class HullSettings:
     resolution: int = 256
     """Voxels along the grid's longest side."""
     components: Literal["explain", "drop-small", "all", "largest"] = "explain"
-    """Which pieces stay; they touch each other nowhere (26 neighbours). "explain": those that cover foreground
+    """Which pieces stay: parts that touch nowhere (26 neighbours). "explain": those that cover foreground
     which no better piece covers, so that thin parts that broke off stay and pieces in front of or behind the
     object go, whatever their size. "drop-small": those not small beside the largest. "all". "largest". Where one
     view is enough ("traditional", "unit-sphere", k = 1) "explain" finds the bounds, but of the grid's pieces only

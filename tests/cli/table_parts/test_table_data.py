@@ -135,7 +135,7 @@ def test_a_dry_run_names_a_scene_that_cannot_be_read(root, capsys, views):
     status = table.main(["t.yaml", "--root", "mine=mine", "--dry-run", "--device", "cpu"])
     listed, said = capsys.readouterr()
     assert status == (views == 5)
-    assert listed.startswith("cannot be read" if views == 5 else "run") and "1 job, 1 run, 1 of" in listed
+    assert listed.startswith("cannot run" if views == 5 else "run") and "1 job, 1 run, 1 of" in listed
     assert ("there is no sparse_5.txt" in said) == (views == 5)
 
 

@@ -80,7 +80,7 @@ def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | Non
 
     Returns:
         the exit status, and what there is of the runs; None in place of it when they were only listed, where the
-        status is 1 for scenes that cannot be read.
+        status is 1 for runs that cannot be made: scenes that cannot be read, a K above the number of views.
     """
     load_torch()
     from visdom_plugin.cli.table_parts.workshop import make_workshop
@@ -210,7 +210,7 @@ def describe_plan(made: Plan) -> list[str]:
             if job.run_dir in seen:
                 word = "shared"
             elif made.tasks[job.run_dir].trouble and outcome.status != "finished":
-                word = "cannot be read"
+                word = "cannot run"
             elif outcome.status == "waiting" and is_held(job.run_dir):
                 word = "running"
             elif outcome.status == "waiting" and (step := read_step(job.run_dir)):
