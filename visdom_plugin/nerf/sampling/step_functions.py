@@ -62,7 +62,8 @@ def sample_distances(
     if edges.device.type == "cpu":
         edges, distances = _sample_cpu(edges, weights, count, jitter, (near, far), exponent, power)
         return edges, distances
-    edges = _sample_torch(edges, weights**exponent, count, jitter)
+    lead = torch.broadcast_shapes(edges.shape[:-1], near.shape[:-1])
+    edges = _sample_torch(edges.expand(*lead, edges.shape[-1]), weights**exponent, count, jitter)
     return edges, ray_warp.distances_of(edges, near, far, power)
 
 
@@ -92,11 +93,12 @@ def _jitter_of(edges: Tensor, count: int, jitter: Tensor | None) -> Tensor:
 
 def _sample_torch(edges: Tensor, weights: Tensor, count: int, jitter: Tensor | None) -> Tensor:
     jitter = _jitter_of(edges, count, jitter)
-    edges = edges.expand(*weights.shape[:-1], -1)
+    lead = torch.broadcast_shapes(*(x.shape[:-1] for x in (edges, weights, jitter)))
+    edges, weights = (x.expand(*lead, x.shape[-1]) for x in (edges, weights))
     mass = weights.clamp_min(LEAST_WEIGHT).cumsum(-1)
     mass = torch.nn.functional.pad(mass / mass[..., -1:], (1, 0))
     steps = torch.arange(count, dtype=mass.dtype, device=mass.device)
-    u = ((steps + jitter) / count).expand(*mass.shape[:-1], count).contiguous()
+    u = ((steps + jitter) / count).expand(*lead, count).contiguous()
     points = _interpolate(mass, edges, u)
     middles = 0.5 * (points[..., 1:] + points[..., :-1])
     first = (2 * points[..., :1] - middles[..., :1]).maximum(edges[..., :1])
