@@ -282,6 +282,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         rays = self.bound(origins, directions, self.hooks_at_inference())
         counts = self.config.test_samples or self.config.samples
         n = len(rays.near)
+        background = background.to(rays.near.dtype)
         rgb, alpha, depth = background.expand(n, 3).clone(), torch.zeros_like(rays.near), rays.far.clone()
         left, level = rays.hit.nonzero()[:, 0], None
         rays = LocalRays(*(x[left] for x in rays))
