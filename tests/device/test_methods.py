@@ -88,7 +88,7 @@ def walk(method, batch_of, steps):
 
 
 @pytest.mark.parametrize("preset", list(presets()))
-def test_a_method_does_the_same_off_the_cpu(preset, device, scene):
+def test_a_method_does_the_same_off_the_cpu(preset, device, scene, tmp_path):
     results = []
     for where in (torch.device("cpu"), device):
         method, batch_of = start(preset, scene, where)
@@ -100,6 +100,7 @@ def test_a_method_does_the_same_off_the_cpu(preset, device, scene):
         white = torch.ones(3, device=where)
         view = again.render(scene.test.cameras[0].to(where), white)
         assert view.rgb.device == where
+        assert all(path.stat().st_size for path in again.export(tmp_path))
         results.append((losses, view.rgb.cpu(), view.alpha.cpu()))
     (here, *pictures), (there, *others) = results
     for a, b in zip(here, there, strict=True):

@@ -271,7 +271,7 @@ def test_variants_differ_only_in_what_they_name():
             assert replace(getattr(mask, budget), **kept) == base
             kept |= {"hull": None, "vd": base.vd}
             if budget == "quick" and name == "zipnerf-lite":
-                kept["samples"] = base.samples
+                kept |= {"samples": base.samples, "density_bias": base.density_bias}
             assert replace(getattr(vd, budget), **kept) == base
             assert base.mask_weight == 0 and base.background == "white" and not base.vd.enabled
     assert registry.find("zipnerf+vd") is registry.find("zipnerf-lite+vd")
