@@ -23,6 +23,8 @@ METHODS = (
     *("ingp+vd", "vaxnerf+hull", "visdom-field", "zerorf-lite+vd", "zipnerf-lite+vd"),
 )
 """One variant of each: others have the same kernels but for a few. GaussianObject needs weights from elsewhere."""
+DRAWN = {"zipnerf-lite+vd": ["--method.density-bias", "-6"]}
+"""Without which nothing is drawn after so few steps, which is an error."""
 
 
 def jobs() -> dict[str, list[str]]:
@@ -30,7 +32,7 @@ def jobs() -> dict[str, list[str]]:
     commands = {"hull": ["hull", "--out", "hull.ply"], "check": ["check"]}
     for name in METHODS:
         few = ["--method.steps", "3", "--device", "cpu", "--out", "run", "--no-report"]
-        commands[training_job(name)] = ["train", f"method:{name}", *few]
+        commands[training_job(name)] = ["train", f"method:{name}", *few, *DRAWN.get(name, [])]
     return commands
 
 

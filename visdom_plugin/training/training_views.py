@@ -51,9 +51,10 @@ def refuse_empty(method: Renderer, views: Views, device: torch.device, where: Pa
             raise TrainingError(
                 f"nothing is drawn in training view {views.names[i]}: the model is empty there",
                 where=where,
-                cause="an optimisation that removed the object, or a pose that looks past the others' object",
-                todo="look at the data with visdom-check, and in log.jsonl where the loss went up; visdom-eval "
-                "measures the run as it is",
+                cause="a schedule of so few steps that nothing has appeared yet, an optimisation that removed the "
+                "object, or a pose that looks past the others' object",
+                todo="give more --method.steps if there were less than 200; else look at the data with "
+                "visdom-check, and in log.jsonl where the loss went up; visdom-eval measures the run as it is",
             )
 
 

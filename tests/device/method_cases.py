@@ -18,8 +18,6 @@ from visdom_plugin.splat.cpu.backend import _Blend, _Project
 from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.run import build, choose_batches
 
-pytestmark = pytest.mark.skipif(not second.supported(), reason="needs torch 2.9 or newer")
-
 STEPS = 3
 # Adam makes whole steps of gradients that are rounding alone, such as those of a bias before a normalisation.
 SLOW = {
