@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -57,7 +58,8 @@ class GaussianOptimiser:
     @torch.no_grad()
     def step(self) -> None:
         """One Adam step; gradients are dropped afterwards."""
-        updates = []
+        here: list[adam.Update] = []
+        elsewhere: list[_Elsewhere] = []
         for name, parameter in self.parameters.items():
             if parameter.grad is None:
                 continue
@@ -72,11 +74,12 @@ class GaussianOptimiser:
                 row = math.prod(parameter.shape[1:])
                 shares = adam.repeat(3 if name == "sh" else row, row, SLOW)
                 p, g, m, v = (t.view(-1).numpy() for t in tensors)
-                updates.append(adam.Update(p, g, m, v, shares, rate, root))
+                here.append(adam.Update(p, g, m, v, shares, rate, root))
             else:
-                update_by_torch(*tensors, rate, root, harmonics=name == "sh")
+                elsewhere.append(_Elsewhere(*tensors, rate, root, slow=name == "sh"))
             parameter.grad = None
-        adam.update(updates, BETAS, EPSILON)
+        adam.update(here, BETAS, EPSILON)
+        update_by_torch(elsewhere)
 
     def keep(self, kept: Tensor) -> None:
         """Keeps the Gaussians where `kept` (N,) bool is True."""
@@ -138,23 +141,36 @@ class GaussianOptimiser:
                 self._moments[name] = Moments(read("adam.{}.exp_avg"), read("adam.{}.exp_avg_sq"), int(steps))
 
 
-def update_by_torch(
-    parameter: Tensor,
-    gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    rate: float,
-    root: float,
-    *,
-    harmonics: bool,
-) -> None:
-    """`adam.update` of one parameter on any device, harmonics (N, B, 3) or not."""
-    mean.lerp_(gradient, 1 - BETAS[0])
-    square.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
-    change = rate * mean / (square.sqrt() / root + EPSILON)
-    if harmonics:
-        change[:, 1:] *= SLOW
-    parameter -= change
+class _Elsewhere(NamedTuple):
+    """`adam.Update` on any device."""
+
+    parameter: Tensor
+    gradient: Tensor
+    mean: Tensor
+    square: Tensor
+    rate: float
+    root: float
+    slow: bool
+    """Harmonics (N, B, 3)."""
+
+
+def update_by_torch(updates: Sequence[_Elsewhere]) -> None:
+    """`adam.update` on any device: on a GPU an operation launches one kernel for all parameters."""
+    if not updates:
+        return
+    parameters, gradients, means, squares, rates, roots, slow = (list(x) for x in zip(*updates, strict=True))
+    torch._foreach_lerp_(means, gradients, 1 - BETAS[0])
+    torch._foreach_mul_(squares, BETAS[1])
+    torch._foreach_addcmul_(squares, gradients, gradients, 1 - BETAS[1])
+    divisors = torch._foreach_sqrt(squares)
+    torch._foreach_div_(divisors, roots)
+    torch._foreach_add_(divisors, EPSILON)
+    changes = torch._foreach_mul(means, rates)
+    torch._foreach_div_(changes, divisors)
+    for change, harmonics in zip(changes, slow, strict=True):
+        if harmonics:
+            change[:, 1:] *= SLOW
+    torch._foreach_sub_(parameters, changes)
 
 
 def _split(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
