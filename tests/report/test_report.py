@@ -71,6 +71,13 @@ def test_no_report_leaves_it_out_and_it_can_be_made_later(fakes, capsys):
     assert (run / "report" / "data.json").stat().st_mtime_ns > drawn
 
 
+def _dotted(text: str) -> list[str]:
+    """The dotted lines of a page's curves."""
+    found = re.findall(r'<path d="([^"]+)"[^>]*stroke-dasharray: ?1,', text[text.index('id="curves"') :])
+    assert len(found) == 3
+    return found
+
+
 def test_what_a_method_says_of_its_steps_is_marked_in_the_curve(fakes, monkeypatch):
     events = {"opacities reset": [5, 10], "nothing": [], "last Gaussians added": [15]}
     monkeypatch.setattr(fake.FakeMethod, "events", lambda self: events, raising=False)
@@ -81,6 +88,11 @@ def test_what_a_method_says_of_its_steps_is_marked_in_the_curve(fakes, monkeypat
     curves = text[text.index('id="curves"') :]
     assert curves.count("<title>opacities reset</title>") == 2 and "nothing" not in curves
     record = json.loads((run / "run.json").read_text())
+    # A schedule that is longer than what the config calls its steps.
+    longer = record | {"config": record["config"] | {"steps": 10}}
+    (run / "run.json").write_text(json.dumps(longer))
+    assert report.main([str(run), "--quiet"]) == 0
+    assert _dotted((run / "report.html").read_text(encoding="utf-8")) == _dotted(text)
     (run / "run.json").write_text(json.dumps(record | {"events": {}}))
     assert report.main([str(run), "--quiet"]) == 0
     assert "Dotted" not in (run / "report.html").read_text(encoding="utf-8")

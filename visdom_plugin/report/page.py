@@ -15,7 +15,7 @@ from urllib.parse import quote
 from visdom_plugin.atomic_files import write_bytes
 from visdom_plugin.errors import list_some
 from visdom_plugin.report.gather import DATA, FOLDER, state_of
-from visdom_plugin.tables.report.svg_figures import draw_curves, pen, read_curve
+from visdom_plugin.tables.report.svg_figures import draw_curves, pen, read_curve, read_last_step
 from visdom_plugin.training.runs.run_directory import read_record
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def to_html(runs: Sequence[Reported], folder: Path) -> str:
         metrics=_metrics(runs),
         places=_places(runs),
         curves=Markup(draw_curves(series, marks)) if series else "",
-        marked=_describe_marks(runs),
+        marked=_describe_marks(runs, marks),
         several=len(runs) > 1,
         same_data=_same_data(runs),
     )
@@ -97,15 +97,15 @@ def _marks(runs: Sequence[Reported]) -> dict[str, list[float]]:
     """What happened at which shares of the schedule, where it is one for all runs."""
     found = []
     for run in runs:
-        total = run.record["config"].get("steps")
-        events = run.record.get("events", {}) if total else {}
-        found.append({what: [step / total for step in steps] for what, steps in events.items() if steps})
+        last = read_last_step(run.path)
+        events = run.record.get("events", {}) if last else {}
+        found.append({what: [step / last for step in steps] for what, steps in events.items() if steps})
     return found[0] if found and all(marks == found[0] for marks in found) else {}
 
 
-def _describe_marks(runs: Sequence[Reported]) -> str:
+def _describe_marks(runs: Sequence[Reported], marks: dict[str, list[float]]) -> str:
     """The sentence below the curves; empty where nothing is marked."""
-    if not _marks(runs):
+    if not marks:
         return ""
     events = runs[0].record["events"]
     listed = "; ".join(f"{what} after step {list_some(steps, 8)}" for what, steps in events.items() if steps)

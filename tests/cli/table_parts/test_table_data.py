@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -175,8 +176,30 @@ def test_a_column_names_built_in_scenes(tmp_path, capsys):
     assert "builtin:chair" in said and "two.yaml" in said
 
 
-def test_a_k_above_the_number_of_views_is_told_before_a_run(root):
-    (task,) = _plan(root, settings={"hull.k": 5}, views=[4]).tasks.values()
-    assert "K = 5 is more than the 4 views" in task.trouble and "hull.k" in task.trouble
-    (task,) = _plan(root, settings={"hull.k": 4}, views=[4]).tasks.values()
-    assert not task.trouble
+@pytest.mark.parametrize("kind", ["train", "hull"])
+def test_a_k_above_the_number_of_views_is_refused_when_the_table_is_read(root, kind, monkeypatch):
+    monkeypatch.setattr(DataHasher, "_look", lambda *_: pytest.fail("a scene was read"))
+    with pytest.raises(ConfigError, match="K = 5 is more than the 4 views") as caught:
+        _plan(root, kind, settings={"hull.k": 5}, views=[6, 4])
+    assert str(caught.value.where) == "row 'A' and column 'c' of t.yaml"
+    assert "hull.k" in caught.value.todo and "--only" in caught.value.todo
+    monkeypatch.undo()
+    for k in (4, "auto", "n-1"):
+        (task,) = _plan(root, kind, settings={"hull.k": k}, views=[4]).tasks.values()
+        assert not task.trouble
+
+
+def test_rows_beside_one_with_too_large_a_k_run_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rows = [
+        {"label": "all", "method": "ingp+vd", "settings": {"hull.k": 4}},
+        {"label": "bare", "method": "ingp"},
+    ]
+    content = {"rows": rows, "columns": [{"label": "c", "views": [3]}], "budget": "quick"}
+    Path("t.yaml").write_text(json.dumps(content))
+    words = ["t.yaml", "--dry-run", "--device", "cpu"]
+    assert table.main(words) == 2
+    listed, said = capsys.readouterr()
+    assert not listed and "row 'all' and column 'c' of t.yaml" in said and "K = 4 is more than the 3" in said
+    assert table.main([*words, "--only", "bare"]) == 0
+    assert not (tmp_path / "tables").exists()

@@ -31,6 +31,8 @@ def go(config, scene, folder, seconds=1e9):
 def test_a_run_interrupted_in_every_stage_ends_as_one_that_was_not(small, scene, tmp_path, monkeypatch):
     whole = go(small, scene, tmp_path / "whole")
     assert whole["status"] == "finished" and whole["model"]["stage"] == 4
+    starts = {"leave-one-out begins": [12], "fine-tuning begins": [84], "repair begins": [90]}
+    assert whole["events"] == {"last Gaussians added": [6]} | starts
     real = GaussianObject.train_step
     for stop in (5, 40, 87, 95):
 
@@ -45,6 +47,7 @@ def test_a_run_interrupted_in_every_stage_ends_as_one_that_was_not(small, scene,
     monkeypatch.setattr(GaussianObject, "train_step", real)
     cut = go(small, scene, tmp_path / "cut")
     assert cut["resumed_from"] == 95 and cut["metrics"] == whole["metrics"]
+    assert cut["events"] == whole["events"]
     one, other = (checkpoints.load_newest(tmp_path / name / "checkpoints") for name in ("whole", "cut"))
     assert one.step == other.step == 100 and one.tensors.keys() == other.tensors.keys()
     assert all(torch.equal(value, other.tensors[name]) for name, value in one.tensors.items())

@@ -5,8 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from method_configs.gaussian_object import SPEC
 from tests.methods.short_runs import CPU, advance, copy_of, same, set_up
 from visdom_plugin.errors import CheckpointError, SceneError
+from visdom_plugin.hull.domain import VisibleDomain
 from visdom_plugin.methods.repair.gaussian_object import GaussianObject
 from visdom_plugin.methods.splats.gs_go import GsGo
 from visdom_plugin.training.runs import checkpoints
@@ -61,6 +63,21 @@ def test_a_run_killed_in_any_stage_goes_on_as_if_it_had_not_been(
         until = steps[steps.index(cut) + 1]
         advance(resumed, scene, range(cut, until))
         assert same(copy_of(resumed), states[until])
+
+
+def test_the_curve_is_marked_where_stages_begin_networks_or_not(scene):
+    config = replace(SPEC.quick, hull=VisibleDomain(resolution=48), initial_points=300)
+    coarse, loo, tuning = (
+        config.steps,
+        4 * (2 * config.loo.steps - config.loo.view_returns),
+        config.lora.steps,
+    )
+    method = set_up(
+        GaussianObject, config, scene, config.hull.carve(scene.train.cameras, scene.train.masks), hooks=[]
+    )
+    starts = {"leave-one-out": coarse, "fine-tuning": coarse + loo, "repair": coarse + loo + tuning}
+    marked = {f"{stage} begins": [step] for stage, step in starts.items()}
+    assert method.events() == method.coarse.events() | marked and method.coarse.events()
 
 
 def test_the_coarse_stage_is_3dgs_go(straight, scene, hull, small):

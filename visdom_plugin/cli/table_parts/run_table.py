@@ -80,7 +80,7 @@ def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | Non
 
     Returns:
         the exit status, and what there is of the runs; None in place of it when they were only listed, where the
-        status is 1 for runs that cannot be made: scenes that cannot be read, a K above the number of views.
+        status is 1 for scenes that cannot be read.
     """
     load_torch()
     from visdom_plugin.cli.table_parts.workshop import make_workshop
@@ -95,7 +95,8 @@ def run_spec(spec: TableSpec, options: TableOptions) -> tuple[int, Results | Non
     folder, runs = find_folders(spec, options)
     # Refuses metrics, layouts and places in the paper that are not there.
     summarise(Results(spec))
-    made = plan(spec, runs, make_workshop(options.device, options.executor), _read_roots(spec, options))
+    workshop = make_workshop(options.device, options.executor)
+    made = plan(spec, runs, workshop, _read_roots(spec, options), only)
     overview = Overview(quiet=options.quiet)
     executor = _make_executor(spec, options, runs, overview.tick)
     if options.executor != "slurm" and not options.dry_run:

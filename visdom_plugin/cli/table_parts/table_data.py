@@ -42,6 +42,13 @@ def tidy_reading(reading: Settings, where: str) -> Settings:
     return resolve_lists({name: getattr(checked, name) for name in reading})
 
 
+def require_views(settings: object, views: int) -> None:
+    """Raises ConfigError where a row's hull has a K above the number of views; settings without a hull pass."""
+    hull = getattr(settings, "hull", None)
+    if isinstance(hull, HullSettings):
+        hull.require_views(views)
+
+
 class DataHasher:
     """Hashes of what jobs are made from. Each file is read once; make another when files may have changed."""
 
@@ -62,12 +69,6 @@ class DataHasher:
             SceneError: for a scene that cannot be read.
             ConfigError: for a reading that does not fit the scene.
         """
-        hull = getattr(settings, "hull", None)
-        if isinstance(hull, HullSettings):
-            try:
-                hull.require_views(int(str(reading["views"])))
-            except ConfigError as error:  # of this job; the table's others can be run
-                raise SceneError(error.what, where="hull.k", todo=error.todo, topic=error.topic) from error
         if _name_built_in(folder) is not None:
             from datamodules.synthetic.config import SyntheticConfig
 

@@ -6,7 +6,7 @@ import difflib
 import logging
 from collections.abc import Sequence
 
-from visdom_plugin.cli.table_parts.table_data import DataHasher, tidy_reading
+from visdom_plugin.cli.table_parts.table_data import DataHasher, require_views, tidy_reading
 from visdom_plugin.errors import ConfigError, PluginError
 from visdom_plugin.specs import check_requirements
 from visdom_plugin.tables.run.jobs import Resolved, Workshop
@@ -32,6 +32,7 @@ def make_workshop(device: str = "auto", executor: str | None = None) -> Workshop
         modules=MODULES,
         hash_data=DataHasher(),
         tidy_reading=tidy_reading,
+        require_views=require_views,
         device=device,
     )
 

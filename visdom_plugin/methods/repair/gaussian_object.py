@@ -147,6 +147,11 @@ class GaussianObject:
         """What is shown of the model while it trains, and noted in run.json."""
         return self._shown().summary() | {"stage": self.number + 1}
 
+    def events(self) -> dict[str, list[int]]:
+        """What changes in the coarse stage, see `Strategy.events`, and where the later stages begin."""
+        starts = {f"{name} begins": [sum(self.lengths[:i])] for i, name in enumerate(NAMES) if i}
+        return self.coarse.events() | starts
+
     def export(self, folder: Path) -> list[Path]:
         return self._shown().export(folder)
 

@@ -41,15 +41,26 @@ def read_curve(run_dir: Path) -> np.ndarray | None:
 
     Lines that cannot be read are left out.
     """
+    points, last = _read_log(run_dir)
+    return np.array(sorted(points)) / (last, 1.0) if len(points) > 1 else None
+
+
+def read_last_step(run_dir: Path) -> int:
+    """The step at which the curve of `read_curve` ends; 0 where nothing was logged."""
+    return _read_log(run_dir)[1]
+
+
+def _read_log(run_dir: Path) -> tuple[list[tuple[int, float]], int]:
+    """(step, PSNR) where it was measured, and the last step that was logged."""
     path = Path(run_dir) / "log.jsonl"
     try:
-        return _read_log(path, path.stat().st_mtime_ns)
+        return _parse_log(path, path.stat().st_mtime_ns)
     except OSError:
-        return None
+        return [], 0
 
 
 @lru_cache(maxsize=8192)
-def _read_log(path: Path, written: int) -> np.ndarray | None:
+def _parse_log(path: Path, written: int) -> tuple[list[tuple[int, float]], int]:
     """`written`: the file's age, so that a driver that writes its table many times reads each log once."""
     points, last = [], 0
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -61,9 +72,7 @@ def _read_log(path: Path, written: int) -> np.ndarray | None:
         last = max(last, step)
         if isinstance(value, (int, float)) and np.isfinite(value):
             points.append((step, float(value)))
-    if len(points) < 2:
-        return None
-    return np.array(sorted(points)) / (last, 1.0)
+    return points, last
 
 
 def average_curves(curves: Sequence[np.ndarray]) -> np.ndarray:

@@ -11,7 +11,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -52,6 +52,8 @@ class Workshop:
     data that such a job reads."""
     tidy_reading: Callable[[Settings, str], Settings] = lambda reading, where: dict(reading)
     """(a column's `reading`, where it stands) to the same, checked, with full paths."""
+    require_views: Callable[[object, int], None] = lambda settings, views: None
+    """(a row's settings, a column's number of views) raises ConfigError where there are too few views."""
     device: str = "auto"
 
 
@@ -107,18 +109,27 @@ def variable_of(root: str) -> str:
     return "VISDOM_ROOT_" + re.sub(r"\W", "_", root).upper()
 
 
-def plan(spec: TableSpec, runs: Path, workshop: Workshop, roots: Mapping[str, Path] | None = None) -> Plan:
+def plan(
+    spec: TableSpec,
+    runs: Path,
+    workshop: Workshop,
+    roots: Mapping[str, Path] | None = None,
+    only: Sequence[int] | None = None,
+) -> Plan:
     """All jobs of a table.
 
     Args:
         runs: folder of run directories.
         roots: name to folder of data roots.
+        only: positions of the rows that will be run, where not all are.
 
     Raises:
         ConfigError: for a setting that a row's method does not have or that is out of range (naming the row), a
-            root that is no folder, a scene that is not in it, and a mixture of protocols.
+            row to be run that needs more views than a column has, a root that is no folder, a scene that is not
+            in it, and a mixture of protocols.
     """
     resolved = [_resolve(spec, row, workshop) for row in spec.rows]
+    _refuse_few_views(spec, resolved, workshop, only)
     readings = [workshop.tidy_reading(column.reading, _place(spec, column)) for column in spec.columns]
     refuse_mixture(_facts(spec, resolved), spec.varies, spec.source)
     folders = [_find_scenes(spec, column, dict(roots or {})) for column in spec.columns]
@@ -154,6 +165,25 @@ def _resolve(spec: TableSpec, row: Row, workshop: Workshop) -> Resolved | None:
             raise
         # Raised by a config class, which knows its own name only.
         raise _within(where, error) from error
+
+
+def _refuse_few_views(
+    spec: TableSpec, resolved: list[Resolved | None], workshop: Workshop, only: Sequence[int] | None
+) -> None:
+    rows = range(len(resolved)) if only is None else only
+    for i, column in product(rows, spec.columns):
+        found = resolved[i]
+        if found is not None:
+            try:
+                workshop.require_views(found.config, min(column.views))
+            except ConfigError as error:
+                label = spec.rows[i].label
+                raise ConfigError(
+                    error.what,
+                    where=f"row {label!r} and column {column.label!r} of {spec.source}",
+                    todo="change the row's hull.k or the column's views; or run the other rows alone, with --only",
+                    topic=error.topic,
+                ) from error
 
 
 def _within(where: str, error: ConfigError) -> ConfigError:
