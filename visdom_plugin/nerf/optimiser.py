@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 
+from visdom_plugin.nerf import adam
+
 SMALL = 1 << 14
-"""Numbers of a tensor below which it is a part of a larger one: Adam wakes all threads for every tensor."""
+"""Numbers of a tensor below which it is a part of a larger one: Adam has a price for every tensor."""
 
 
 class FieldOptimiser:
-    """One fused Adam over several groups of named parameters.
+    """One Adam over several groups of named parameters: a kernel on the CPU, torch's fused one elsewhere.
 
     Small parameters of a group become views of one tensor, which is what Adam sees; one without a gradient counts
     as one whose gradient is 0.
@@ -33,7 +36,7 @@ class FieldOptimiser:
         decoupled: bool = False,
         clip: float | None = None,
     ):
-        self.clip = clip
+        self.betas, self.epsilon, self.decoupled, self.clip = betas, eps, decoupled, clip
         self.parameters = {name: p for named, _ in groups for name, p in named.items()}
         self._joint: list[tuple[nn.Parameter, list[nn.Parameter]]] = []
         kind = torch.optim.AdamW if decoupled else torch.optim.Adam
@@ -65,8 +68,34 @@ class FieldOptimiser:
         for joint, small in self._joint:
             gradients = (torch.zeros_like(p) if p.grad is None else p.grad for p in small)
             joint.grad = torch.cat([g.reshape(-1) for g in gradients])
-        self.adam.step()
+        if all(p.device.type == "cpu" and p.dtype == torch.float32 for p in self.parameters.values()):
+            self._step_by_kernel()
+        else:
+            self.adam.step()
         self.drop_gradients()
+
+    @torch.no_grad()
+    def _step_by_kernel(self) -> None:
+        """`adam.step()`, with its state."""
+        updates = []
+        for group in self.adam.param_groups:
+            rate, decay = group["lr"], group["weight_decay"]
+            for p in group["params"]:
+                if p.grad is None:
+                    continue
+                state = self.adam.state[p]
+                if not state:
+                    state |= {k: torch.zeros_like(p) for k in ("exp_avg", "exp_avg_sq")}
+                    state["step"] = torch.zeros(())
+                state["step"] += 1
+                first, second = (1 - beta ** float(state["step"]) for beta in self.betas)
+                flat = (
+                    x.detach().view(-1).numpy()
+                    for x in (p, p.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"])
+                )
+                decays = (0.0, 1 - rate * decay) if self.decoupled else (decay, 1.0)
+                updates.append(adam.Update(*flat, rate / first, math.sqrt(second), *decays))
+        adam.update(updates, self.betas, self.epsilon)
 
     def drop_gradients(self) -> None:
         """Leaves no gradient for the next step to add to."""
@@ -136,8 +165,6 @@ def warm_up_and_decay(
 
     mip-NeRF's: rise = delay + (1 - delay) sin(pi / 2 min(step / warm_up, 1)).
     """
-    import math
-
     rise = delay + (1 - delay) * math.sin(0.5 * math.pi * min(step / warm_up, 1)) if warm_up else 1.0
     t = min(step / max(total, 1), 1)
     return rise * first ** (1 - t) * last**t
