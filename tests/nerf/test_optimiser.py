@@ -77,13 +77,16 @@ def test_a_state_from_before_any_step_has_no_moments():
 
 
 def test_the_number_of_threads_changes_no_bit():
-    moved = []
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        parameters = _parameters()
-        optimiser = _mine(parameters)
-        for step in range(3):
-            _give_gradients(parameters, step)
-            optimiser.step(0.01)
-        moved.append(parameters)
+    moved, before = [], torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            parameters = _parameters()
+            optimiser = _mine(parameters)
+            for step in range(3):
+                _give_gradients(parameters, step)
+                optimiser.step(0.01)
+            moved.append(parameters)
+    finally:
+        torch.set_num_threads(before)
     assert all(torch.equal(moved[0][k], moved[1][k]) for k in SHAPES)

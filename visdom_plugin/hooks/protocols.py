@@ -50,10 +50,12 @@ class SamplerHook(Protocol):
 
 @runtime_checkable
 class PixelSampler(Protocol):
-    """What a sampler hook may offer besides: to ask once for all training pixels, whose rays never change."""
+    """What a sampler hook may offer besides: to be asked once about all training pixels, whose rays never change.
+
+    A method may ask `bound` about them, keep the answers, and not ask again."""
 
     def follow_pixels(self, cameras: Cameras) -> None:
-        """Names the training cameras (N,), on the device of the rays; called once, in `setup`."""
+        """Names the training cameras (N,), on the device of the rays; called in `setup`, if at all."""
         ...
 
     def bound_pixels(

@@ -89,12 +89,12 @@ class FieldOptimiser:
                     state["step"] = torch.zeros(())
                 state["step"] += 1
                 first, second = (1 - beta ** float(state["step"]) for beta in self.betas)
-                flat = (
-                    x.detach().view(-1).numpy()
-                    for x in (p, p.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"])
-                )
+                tensors = p, p.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"]
+                of, gradient, mean, square = (x.detach().view(-1).numpy() for x in tensors)
                 decays = (0.0, 1 - rate * decay) if self.decoupled else (decay, 1.0)
-                updates.append(adam.Update(*flat, rate / first, math.sqrt(second), *decays))
+                updates.append(
+                    adam.Update(of, gradient, mean, square, rate / first, math.sqrt(second), *decays)
+                )
         adam.update(updates, self.betas, self.epsilon)
 
     def drop_gradients(self) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,7 +18,8 @@ from visdom_plugin.geometry.cameras import rays_of
 from visdom_plugin.hooks.configs import SamplerConfig
 from visdom_plugin.hooks.protocols import RayBounds
 from visdom_plugin.hull.domain import VisibleDomain
-from visdom_plugin.methods.fields.common import mesh_density
+from visdom_plugin.methods.fields import common
+from visdom_plugin.methods.fields.common import bound_rays, mesh_density
 from visdom_plugin.methods.fields.ingp import Ingp
 from visdom_plugin.methods.fields.marched import MarchedField
 from visdom_plugin.methods.fields.zerorf_lite import ZeroRfLite
@@ -188,6 +190,42 @@ def test_training_samples_stay_within_the_hooks_bounds(method_class, scene, hull
     # A cube no larger than the object leaves less to cut.
     most = 0.7 if method_class is ZeroRfLite else 0.5
     assert length[rays.hit].mean() < most * own[rays.hit].mean()
+
+
+@METHODS
+def test_bounds_of_training_pixels_are_asked_for_once_and_are_those_of_their_rays(
+    method_class, scene, hull, monkeypatch
+):
+    monkeypatch.setattr(common, "PIXELS_AT_ONCE", 1000)
+    method = start(method_class, scene, hull)
+    asked = []
+    bound = method.hooks[0].bound
+    monkeypatch.setattr(method.hooks[0], "bound", lambda *rays: asked.append(1) or bound(*rays))
+    data = DataManager(scene.train, seed=0)
+    for step in range(2):
+        batch = data.pixel_batch(step, 200)
+        found = method.training_rays(batch)
+        assert len(asked) == -(-sum(m.numel() for m in scene.train.masks) // 1000)
+        expected = bound_rays(
+            batch.origins,
+            batch.directions,
+            *method.own_bounds(batch.origins, batch.directions),
+            method.frame,
+            [SimpleNamespace(bound=bound)],
+        )
+        assert all(map(torch.equal, found, expected))
+
+
+def test_other_samplers_are_asked_at_every_step(scene, hull):
+    method = start(Ingp, scene, hull)
+    asked = []
+    rays = SimpleNamespace(
+        bound=lambda o, d, near, far: asked.append(1) or Bystander().bound(o, d, near, far)
+    )
+    method = start(Ingp, scene, hull, hooks=[*method.hooks, rays])
+    asked.clear()
+    advance(method, scene, range(3))
+    assert len(asked) == 3
 
 
 def test_hull_at_inference_shows_background_beside_the_hull(trained, scene):

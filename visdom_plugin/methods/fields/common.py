@@ -17,6 +17,7 @@ from torch import Tensor
 from visdom_plugin.compute.waiting import describe_parts, showing
 from visdom_plugin.geometry.cameras import Cameras, rays_of
 from visdom_plugin.geometry.mesh_files import mesh_ply
+from visdom_plugin.geometry.pixel_rays import rays_of_pixels
 from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook
 from visdom_plugin.losses import composite_target, mask_loss
 from visdom_plugin.nerf.frame import Frame
@@ -86,6 +87,37 @@ def bound_rays(
             hit = hit & met
         near, far = near * frame.scale, far * frame.scale
     return LocalRays(frame.to_local(origins), directions.float(), near.float(), far.float(), hit)
+
+
+MOST_PIXELS = 1 << 26
+"""Training pixels whose bounds are kept: 600 MB."""
+PIXELS_AT_ONCE = 1 << 18
+
+
+class PixelBounds:
+    """Bounds of the rays of all training pixels, found at the first question and kept: 9 bytes per pixel.
+
+    Args:
+        cameras: (N,) the training cameras.
+        bound: origins and directions (n, 3) in the world frame to rays with their bounds.
+    """
+
+    def __init__(self, cameras: Cameras, bound: Callable[[Tensor, Tensor], LocalRays]):
+        self.cameras, self.bound = cameras, bound
+        self.found: list[Tensor] | None = None
+
+    def of(self, pixels: Tensor) -> list[Tensor]:
+        """Near, far and hit (n,) of pixels (n,), see `PixelBatch`."""
+        if self.found is None:
+            sizes = self.cameras.width * self.cameras.height
+            ends = sizes.cumsum(0)
+            parts = []
+            for flat in torch.arange(int(ends[-1]), device=ends.device).split(PIXELS_AT_ONCE):
+                view = torch.searchsorted(ends, flat, right=True)
+                rays = rays_of_pixels(self.cameras, view, flat - (ends - sizes)[view])
+                parts.append(self.bound(*rays)[2:])
+            self.found = [torch.cat(x) for x in zip(*parts, strict=True)]
+        return [x.index_select(0, pixels) for x in self.found]
 
 
 def spread_rays(camera: Cameras, most: int = 256) -> tuple[Tensor, Tensor]:

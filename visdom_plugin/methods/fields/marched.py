@@ -88,7 +88,7 @@ class MarchedField(RadianceField[Config]):
             self.occupancy.update(self.density, generator(self.seed, "occupancy", step), fraction=fraction)
         n = len(batch.mask)
         background = self.draw_background(n, draw)
-        rays = self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
+        rays = self.training_rays(batch)
         step_length = torch.where(rays.hit, c.step_length, c.missing_step_length)
         shift = uniform(draw, self.device, n)
         samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks, self.occupancy)

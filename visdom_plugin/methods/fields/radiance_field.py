@@ -14,7 +14,14 @@ from visdom_plugin.geometry.cameras import Cameras, pixel_radius
 from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook, empty_spaces
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.colour_correction import ColourCorrection, CorrectsColours
-from visdom_plugin.methods.fields.common import LocalRays, bound_rays, render_image, spread_rays
+from visdom_plugin.methods.fields.common import (
+    MOST_PIXELS,
+    LocalRays,
+    PixelBounds,
+    bound_rays,
+    render_image,
+    spread_rays,
+)
 from visdom_plugin.methods.fields.configs import IngpConfig, ZeroRfConfig, ZipNerfConfig
 from visdom_plugin.methods.fields.shape_prior import ShapePrior
 from visdom_plugin.nerf.frame import Frame, frame_of
@@ -55,9 +62,7 @@ class RadianceField(CorrectsColours, ABC, Generic[Config]):
         if len(views) <= self.config.few_views and self.config.few_views_share < 1:
             self.total_steps = max(1, round(self.config.few_views_share * self.config.steps))
         cameras = views.cameras.to(device)
-        for hook in self.hooks:
-            if isinstance(hook, PixelSampler):
-                hook.follow_pixels(cameras)
+        self._follow_pixels(cameras)
         self.prior: ShapePrior | None = None
         if self.config.prior_weight > 0 and hull is not None and hull.inner is not None:
             self.prior = ShapePrior(hull, self.frame)
@@ -98,6 +103,24 @@ class RadianceField(CorrectsColours, ABC, Generic[Config]):
             self.frame,
             self.rays_at_once,
         )
+
+    def _follow_pixels(self, cameras: Cameras) -> None:
+        """Prepares for questions about the pixels of the training cameras (N,), whose rays never change."""
+        self._kept: PixelBounds | None = None
+        pixels = int((cameras.width * cameras.height).sum())
+        samplers = [hook for hook in self.hooks if isinstance(hook, PixelSampler)]
+        if len(samplers) == len(self.hooks) and pixels <= MOST_PIXELS:
+            self._kept = PixelBounds(cameras, lambda o, d: self.bound(o, d, self.hooks))
+            return
+        for hook in samplers:
+            hook.follow_pixels(cameras)
+
+    def training_rays(self, batch: PixelBatch) -> LocalRays:
+        """The rays of a batch, bounded by the hooks."""
+        if batch.pixels is None or self._kept is None:
+            return self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
+        origins = self.frame.to_local(batch.origins)
+        return LocalRays(origins, batch.directions.float(), *self._kept.of(batch.pixels))
 
     def bound(
         self,

@@ -141,7 +141,7 @@ class ZipNerfLite(RadianceField[ZipNerfConfig]):
         c = self.config
         draw = draw_on(self.device, generator(self.seed, "step", step))
         background = self.draw_background(len(batch.mask), draw)
-        rays = self.bound(batch.origins, batch.directions, self.hooks, batch.pixels)
+        rays = self.training_rays(batch)
         levels, out, squares = self._see(rays, batch.radii, c.samples, step, draw)
         colours = self._shade(out, rays.directions[:, None])
         last = levels[-1]
