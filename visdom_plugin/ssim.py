@@ -57,9 +57,9 @@ def _fits(x: Tensor) -> bool:
 
 
 @cache
-def _window() -> np.ndarray:
+def _window(dtype: np.dtype | type[np.floating] = np.float64) -> np.ndarray:
     weights = np.exp(-0.5 * (np.arange(TAPS) - RADIUS) ** 2 / SIGMA**2)
-    return weights / weights.sum()
+    return (weights / weights.sum()).astype(dtype)
 
 
 @cache
@@ -86,24 +86,26 @@ class _Compare(torch.autograd.Function):
     def forward(ctx, x, y, with_slopes, by_l1, by_ssim, constant):
         shape = x.shape
         images = [
-            z.detach().reshape(-1, shape[-3], shape[-2] * shape[-1]).contiguous().numpy() for z in (x, y)
+            np.ascontiguousarray(z.detach().numpy()).reshape(-1, shape[-3], shape[-2] * shape[-1])
+            for z in (x, y)
         ]
         count, height, _ = images[0].shape
-        window = _window().astype(images[0].dtype)
-        sums = np.zeros((count * height, 2), np.float64)
+        window = _window(images[0].dtype)
+        sums = np.empty((count * height, 2), np.float64)
         slopes = np.empty((3, *images[0].shape) if with_slopes else (3, 0, 0, 0), images[0].dtype)
         parallel_for(_similarity, count * height, ROWS_PER_PIECE, *images, shape[-1], window, sums, slopes)
         ctx.save_for_backward(x, y)
         ctx.rest = (shape[-1], window, slopes, by_l1, by_ssim)
-        l1, similarity = sums.sum(0) / max(images[0].size, 1)
-        return x.new_tensor(by_l1 * l1 + by_ssim * similarity + constant)
+        l1, similarity = (total / max(images[0].size, 1) for total in sums.sum(0).tolist())
+        loss = by_l1 * l1 + by_ssim * similarity + constant
+        return torch.from_numpy(np.array(loss, images[0].dtype))
 
     @staticmethod
     @once_differentiable
     def backward(ctx, by_loss):
         x, y = ctx.saved_tensors
         channels, window, slopes, *weights = ctx.rest
-        images = [z.detach().reshape(slopes.shape[1:]).contiguous().numpy() for z in (x, y)]
+        images = [np.ascontiguousarray(z.detach().numpy()).reshape(slopes.shape[1:]) for z in (x, y)]
         out = np.empty_like(images[0])
         scales = np.array([float(by_loss) * w / max(out.size, 1) for w in weights], out.dtype)
         parallel_for(

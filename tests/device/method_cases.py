@@ -40,8 +40,8 @@ def rasterization(
     motion = torch.linalg.inv(viewmats[0].cpu().double())
     camera = Cameras.from_matrices(Ks[0].cpu(), motion, width=width, height=height)
     parameters = (means, scales.log(), quats, opacities.logit(), colors)
-    packed = backend._pack(camera, near_plane).astype("float32")
-    means2d, splats, radii, tiles = _Project.apply(
+    packed = backend.pack(camera, near_plane, "float32")
+    means2d, splats, radii, _, tiles = _Project.apply(
         *(x.cpu() for x in parameters), sh_degree, packed, width, height
     )
     there = means2d.to(means.device)[None]

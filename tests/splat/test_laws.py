@@ -66,6 +66,17 @@ def test_a_rigid_motion_of_everything_changes_nothing():
         torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=1e-9, atol=1e-9)
 
 
+def test_a_camera_whose_pose_is_changed_in_place_is_drawn_where_it_now_is():
+    gaussians, camera = make_gaussians(n=300).detach(), make_camera()
+    before = rasterise(gaussians, camera, WHITE, near=0.01)
+    camera.world_from_camera[:3, 3] *= 1.1
+    after = rasterise(gaussians, camera, WHITE, near=0.01)
+    fresh = make_camera()
+    fresh.world_from_camera[:3, 3] *= 1.1
+    assert torch.equal(after.rgb, rasterise(gaussians, fresh, WHITE, near=0.01).rgb)
+    assert not torch.equal(after.rgb, before.rgb)
+
+
 def test_alpha_is_bounded_and_the_background_enters_linearly():
     gaussians = make_gaussians(n=400, dtype=torch.float32, scale=0.3, opacity=4.0).detach()
     backgrounds = torch.tensor([[0.0, 0.0, 0.0], [0.3, 1.0, 0.6]])
@@ -117,6 +128,7 @@ def test_what_is_not_drawn_gets_no_gradient_and_no_radius():
     render = rasterise(gaussians, camera, WHITE, near=0.01)
     (render.rgb.sum() + render.depth.sum()).backward()
     assert render.info["visible"].tolist() == [False] * 5 + [True]
+    assert torch.equal(render.info["visible"], (render.info["radii"] > 0).all(-1))
     assert torch.isfinite(render.rgb).all() and render.alpha.any()
     for name, parameter in gaussians.tensors().items():
         assert not parameter.grad[:5].any() and parameter.grad[5].any(), name

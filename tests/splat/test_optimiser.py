@@ -155,6 +155,18 @@ def test_a_parameter_without_a_gradient_stays_and_its_steps_do_not_count():
     assert [k for k in state if k.endswith(".step")] == ["adam.means.step"]
 
 
+def test_a_parameter_that_was_given_other_memory_goes_on_there():
+    straight, moved = (GaussianOptimiser(rows(40, 100), ALL_RATES) for _ in range(2))
+    train(straight, 0, 2)
+    train(moved, 0, 2)
+    for parameter in moved.parameters.values():
+        parameter.data = parameter.data.clone()
+    train(straight, 2, 4)
+    train(moved, 2, 4)
+    for name, value in straight.state_dict().items():
+        assert torch.equal(moved.state_dict()[name], value), name
+
+
 def test_the_state_of_torchs_adam_is_taken_over():
     """Checkpoints that were written when it trained Gaussians go on."""
     own, adam = torch_adam(rows(50, 100))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,6 +49,7 @@ class GaussianOptimiser:
             n: torch.nn.Parameter(p.detach().clone().contiguous()) for n, p in parameters.items()
         }
         self._moments: dict[str, Moments] = {}
+        self._views: dict[str, tuple[int, list[np.ndarray]]] = {}
 
     def __len__(self) -> int:
         return next(iter(self.parameters.values())).shape[0]
@@ -68,18 +70,28 @@ class GaussianOptimiser:
             moments = self._moments[name]
             moments.steps += 1
             first, second = (1 - beta**moments.steps for beta in BETAS)
-            tensors = parameter.detach(), parameter.grad.contiguous(), moments.exp_avg, moments.exp_avg_sq
-            rate, root = self.rates[name] / first, math.sqrt(second)
+            gradient, rate, root = parameter.grad.contiguous(), self.rates[name] / first, math.sqrt(second)
             if parameter.device.type == "cpu" and parameter.dtype == torch.float32:
-                row = math.prod(parameter.shape[1:])
-                shares = adam.repeat(3 if name == "sh" else row, row, SLOW)
-                p, g, m, v = (t.view(-1).numpy() for t in tensors)
-                here.append(adam.Update(p, g, m, v, shares, rate, root))
+                p, m, v, shares = self._view(name)
+                here.append(adam.Update(p, gradient.numpy().reshape(-1), m, v, shares, rate, root))
             else:
+                tensors = parameter.detach(), gradient, moments.exp_avg, moments.exp_avg_sq
                 elsewhere.append(_Elsewhere(*tensors, rate, root, slow=name == "sh"))
             parameter.grad = None
         adam.update(here, BETAS, EPSILON)
         update_by_torch(elsewhere)
+
+    def _view(self, name: str) -> list[np.ndarray]:
+        """A parameter and its moments as flat arrays, and its shares of the learning rate; made once a tensor."""
+        parameter, moments = self.parameters[name], self._moments[name]
+        place, arrays = self._views.get(name, (0, []))
+        if place != parameter.data_ptr() or not arrays:
+            row = math.prod(parameter.shape[1:])
+            tensors = parameter.detach(), moments.exp_avg, moments.exp_avg_sq
+            arrays = [t.view(-1).numpy() for t in tensors]
+            arrays.append(adam.repeat(3 if name == "sh" else row, row, SLOW))
+            self._views[name] = parameter.data_ptr(), arrays
+        return arrays
 
     def keep(self, kept: Tensor) -> None:
         """Keeps the Gaussians where `kept` (N,) bool is True."""
@@ -106,6 +118,7 @@ class GaussianOptimiser:
         change_moments: Callable[[str, Tensor], Tensor] | None = None,
     ) -> None:
         change_moments = change_moments or change
+        self._views.clear()
         for name, old in self.parameters.items():
             self.parameters[name] = torch.nn.Parameter(change(name, old.detach()).contiguous())
         for name, m in self._moments.items():
@@ -126,6 +139,7 @@ class GaussianOptimiser:
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Takes over what `state_dict` gave; the number of Gaussians may differ."""
+        self._views.clear()
         for name, old in self.parameters.items():
 
             def read(text: str, name: str = name, like: Tensor = old) -> Tensor:

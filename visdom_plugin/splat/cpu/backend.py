@@ -6,6 +6,8 @@ looks at. Results repeat to the bit, whatever the number of threads: every sum h
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -30,18 +32,19 @@ def rasterise_cpu(
     """See `rasterise`. float32 or float64, by the dtype of the means."""
     width, height = camera.size
     parameters = gaussians.tensors().values()
-    packed = _pack(camera, near).astype(np.float32 if gaussians.means.dtype == torch.float32 else np.float64)
-    means2d, splats, radii, tiles = _Project.apply(*parameters, degree, packed, width, height)
+    packed = pack(camera, near, "float32" if gaussians.means.dtype == torch.float32 else "float64")
+    means2d, splats, radii, visible, tiles = _Project.apply(*parameters, degree, packed, width, height)
     if means2d.requires_grad:
         means2d.retain_grad()
     rgb, alpha, depth = _Blend.apply(means2d, splats, tiles, background, width, height)
+    conics, _, colours, depths, _ = splats.detach().split((3, 1, 3, 1, projection.RECORD - 8), 1)
     info = {
         "means2d": means2d,
         "radii": radii,
-        "visible": (radii[:, 0] > 0) & (radii[:, 1] > 0),
-        "conics": splats[:, :3].detach(),
-        "colours": splats[:, 4:7].detach(),
-        "depths": splats[:, 7].detach(),
+        "visible": visible,
+        "conics": conics,
+        "colours": colours,
+        "depths": depths.squeeze(1),
         "width": width,
         "height": height,
     }
@@ -63,12 +66,23 @@ def warm_up() -> None:
     optimiser.step()
 
 
-def _pack(camera: Cameras, near: float) -> np.ndarray:
-    """(20,) float64, as the projection kernels expect it."""
-    pose, k = (x.detach().double().cpu().numpy() for x in (camera.world_from_camera, camera.intrinsics))
-    rotation, centre = pose[:3, :3].T, pose[:3, 3]
+def pack(camera: Cameras, near: float, dtype: str) -> np.ndarray:
+    """(20,), as the projection kernels expect it."""
+    matrices = (x.numpy(force=True) for x in (camera.world_from_camera, camera.intrinsics))
+    return _pack(*((x.tobytes(), x.dtype) for x in matrices), near, dtype)
+
+
+Matrix = tuple[bytes, np.dtype]
+
+
+@lru_cache(maxsize=256)
+def _pack(pose: Matrix, intrinsics: Matrix, near: float, dtype: str) -> np.ndarray:
+    """Of matrices (4, 4) and (3, 3), by their numbers: those of training views come again and again."""
+    motion, k = (np.frombuffer(*x).astype(np.float64) for x in (pose, intrinsics))
+    motion, k = motion.reshape(4, 4), k.reshape(3, 3)
+    rotation, centre = motion[:3, :3].T, motion[:3, 3]
     lens = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
-    return np.concatenate([rotation.ravel(), -(rotation @ centre), lens, centre, [near]])
+    return np.concatenate([rotation.ravel(), -(rotation @ centre), lens, centre, [near]]).astype(dtype)
 
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
@@ -95,13 +109,14 @@ class _Project(torch.autograd.Function):
         n, rows, dtype = len(means), len(arrays[0]), arrays[0].dtype
         means2d, splats = np.empty((rows, 2), dtype), np.empty((rows, projection.RECORD), dtype)
         radii, tiles = np.empty((rows, 2), np.int32), np.empty(rows, np.int32)
+        visible = np.empty(rows, np.uint8)
         parallel_for(
             projection.project, n, GAUSSIANS_PER_PIECE, *arrays, degree, camera, width, height,
-            means2d, splats, radii, tiles,
+            means2d, splats, radii, visible, tiles,
         )  # fmt: skip
         ctx.rest = (degree, camera, width, height, splats)
         ctx.set_materialize_grads(False)
-        out = [torch.from_numpy(x[:n]) for x in (means2d, splats, radii, tiles)]
+        out = [torch.from_numpy(x[:n]) for x in (means2d, splats, radii, visible.view(bool), tiles)]
         ctx.mark_non_differentiable(*out[2:])
         return tuple(out)
 

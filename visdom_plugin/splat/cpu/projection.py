@@ -144,11 +144,12 @@ def _fetch_sh(i, count, sh, s):
 @kernel(error_model="numpy")
 def project(
     begin, end, means, log_scales, quaternions, opacity_logits, sh, degree, camera, width, height,
-    means2d, splats, radii, tiles,
+    means2d, splats, radii, visible, tiles,
 ):  # fmt: skip
     """Projects Gaussians begin .. end - 1; see the module's text for the arrays written.
 
-    `radii` (N, 2) are gsplat's, in whole pixels, and `tiles` (N,) how many tiles of the image each meets.
+    `radii` (N, 2) are gsplat's, in whole pixels, `visible` (N,) tells where both are above 0, and `tiles` (N,) how
+    many tiles of the image each meets.
     """
     real = means.dtype.type
     fx, fy, cx, cy, near = camera[12], camera[13], camera[14], camera[15], camera[19]
@@ -216,6 +217,7 @@ def project(
         put(means2d, 2 * i + 1, 2, where(drawn, v, 0))
         put(radii, 2 * i, 2, where(drawn, radius_x, 0))
         put(radii, 2 * i + 1, 2, where(drawn, radius_y, 0))
+        put(visible, i, 1, where(drawn & (radius_x > 0) & (radius_y > 0), fill(real(1)), 0))
         put(tiles, i, 1, count)
 
 
