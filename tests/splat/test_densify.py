@@ -2,10 +2,11 @@
 
 import math
 
+import pytest
 import torch
 
 from visdom_plugin.geometry.rotations import matrix_from_quaternion
-from visdom_plugin.splat.densify import initial_log_scales, split_children, stray_gaussians
+from visdom_plugin.splat.densify import Measured, initial_log_scales, split_children, stray_gaussians
 
 
 def cloud(n: int = 40, seed: int = 0) -> torch.Tensor:
@@ -52,3 +53,23 @@ def test_children_are_distributed_like_their_parent():
     assert torch.allclose(children["means"].T.cov(), covariance, atol=0.01)
     assert torch.allclose(children["log_scales"].exp(), parents["log_scales"].exp().repeat(2, 1) / 1.6)
     assert torch.equal(children["other"], parents["other"].repeat(2))
+
+
+@pytest.mark.parametrize("unit", [1, 200, 53])
+def test_measurements_are_those_of_torch_to_the_bit(unit):
+    n, draw = 5000, torch.Generator().manual_seed(0)
+    size = torch.rand(n, 1, generator=draw) ** 8
+    gradient = torch.randn(n, 2, generator=draw) * size
+    visible = torch.rand(n, generator=draw) < 0.7
+    gradient[~visible] = torch.nan  # of what is not seen nothing counts
+    radii = torch.randint(0, 40, (n, 2), generator=draw, dtype=torch.int32)
+    means2d = torch.zeros(n, 2)
+    means2d.grad = gradient
+    info = {"means2d": means2d, "visible": visible, "radii": radii, "width": 201, "height": 77}
+    fast = slow = Measured.nothing(n, torch.device("cpu"))
+    for _ in range(3):
+        fast = fast.after(info, unit)
+        slow = slow.after_by_torch(gradient, visible, radii, (201 / 2, 77 / 2), unit)
+    assert slow.gradient.any() and slow.radius.any()
+    for name in Measured._fields:
+        assert torch.equal(getattr(fast, name), getattr(slow, name)), name

@@ -7,13 +7,81 @@ Pure functions that say what to change; GaussianOptimiser carries it out.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Generator, Tensor
 
+from visdom_plugin.compute.kernels import kernel
+from visdom_plugin.compute.parallel import parallel_for
 from visdom_plugin.geometry.rotations import matrix_from_quaternion
+
+GAUSSIANS_PER_PIECE = 4096
+
+
+class Measured(NamedTuple):
+    """What was seen of each Gaussian since the last densification."""
+
+    gradient: Tensor
+    """(N,) sum of the norms of the loss's gradient by the projected mean, in normalised device units."""
+    count: Tensor
+    """(N,) in how many steps it was visible."""
+    radius: Tensor
+    """(N,) the largest on screen, in `unit`."""
+
+    @classmethod
+    def nothing(cls, n: int, device: torch.device) -> Measured:
+        return cls(*(torch.zeros(n, device=device) for _ in range(3)))
+
+    def after(self, info: Mapping[str, Any], unit: float) -> Measured:
+        """With one more view, after its backward pass.
+
+        Args:
+            info: of its `Render`.
+            unit: of the radii, in pixels.
+        """
+        gradient, visible, radii = info["means2d"].grad, info["visible"], info["radii"]
+        half = info["width"] / 2, info["height"] / 2
+        if gradient.device.type != "cpu" or gradient.dtype != torch.float32 or radii.ndim == 1:
+            return self.after_by_torch(gradient, visible, radii, half, unit)
+        before = [x.numpy() for x in self]
+        after = [np.empty_like(x) for x in before]
+        arrays = (x.contiguous().numpy() for x in (gradient, visible, radii))
+        scales = (np.float32(x) for x in (*half, unit))
+        parallel_for(_measure, len(before[0]), GAUSSIANS_PER_PIECE, *arrays, *scales, *before, *after)
+        return Measured(*(torch.from_numpy(x) for x in after))
+
+    def after_by_torch(
+        self, gradient: Tensor, visible: Tensor, radii: Tensor, half: tuple[float, float], unit: float
+    ) -> Measured:
+        """The same on any device; radii may be (N,)."""
+        # Numbers, not a tensor: a copy to the GPU would wait for it.
+        u, v = gradient.unbind(-1)
+        norm = torch.stack([u * half[0], v * half[1]], -1).norm(dim=-1)
+        radii = radii if radii.ndim == 1 else radii.amax(-1)
+        return Measured(
+            self.gradient + torch.where(visible, norm, 0),
+            self.count + visible,
+            torch.maximum(self.radius, torch.where(visible, radii, 0).float() / unit),
+        )
+
+
+@kernel(error_model="numpy")
+def _measure(
+    begin, end, slopes, visible, radii, half_width, half_height, unit, gradient, count, radius,
+    new_gradient, new_count, new_radius,
+):  # fmt: skip
+    """Gaussians begin .. end - 1."""
+    for i in range(begin, end):
+        seen = np.float32(visible[i])
+        u, v = slopes[i, 0] * half_width, np.float64(slopes[i, 1] * half_height)
+        # Rounded as torch's norm is, once for the second square and the sum.
+        norm = np.sqrt(np.float32(np.float64(u * u) + v * v))
+        new_gradient[i] = gradient[i] + (norm if visible[i] else np.float32(0))
+        new_count[i] = count[i] + seen
+        new_radius[i] = max(radius[i], seen * np.float32(max(radii[i, 0], radii[i, 1])) / unit)
 
 
 def initial_log_scales(means: Tensor) -> Tensor:

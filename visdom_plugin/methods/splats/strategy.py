@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 from visdom_plugin.hooks.protocols import GaussianHook
 from visdom_plugin.render import Render
-from visdom_plugin.splat.densify import Proximity, split_children, stray_gaussians, unpooled
+from visdom_plugin.splat.densify import Measured, Proximity, split_children, stray_gaussians, unpooled
 from visdom_plugin.splat.model import GaussianSet
 
 log = logging.getLogger(__name__)
@@ -74,9 +74,8 @@ class Schedule:
 class Strategy:
     """Adaptive density control of one set of Gaussians (Kerbl et al. 2023, section 5).
 
-    Its state is what it measured of each Gaussian since the last densification: the sum of the norms of the loss's
-    gradient by the projected mean, in how many steps the Gaussian was seen, and its largest radius: a
-    fraction of the picture's longer side, or in pixels where the schedule's is.
+    Its state is what it measured of each Gaussian since the last densification (`densify.Measured`). Radii are
+    fractions of the picture's longer side, or in pixels where the schedule's is.
 
     Args:
         splats: the set; from here on Gaussians are removed through the strategy alone.
@@ -89,7 +88,7 @@ class Strategy:
         c = splats.config
         first = c.densify_every * (c.densify_from // c.densify_every + 1)
         self.densify_steps = every(c.densify_every, first, c.densify_until)
-        self._gradient = self._count = self._radius = torch.zeros(len(splats), device=splats.device)
+        self._measured = Measured.nothing(len(splats), splats.device)
         self._removed: Counter[str] = Counter()
         self._most, self._warned = len(splats), False
 
@@ -136,45 +135,32 @@ class Strategy:
             return
         self._removed[why] += int(gone.sum())
         self.splats.optimiser.keep(~gone)
-        self._gradient, self._count, self._radius = (
-            x[~gone] for x in (self._gradient, self._count, self._radius)
-        )
+        self._measured = Measured(*(x[~gone] for x in self._measured))
 
     def state_dict(self) -> dict[str, Tensor]:
         """The set's parameters and moments, and the measurements, as a flat dict of tensors."""
         return self.splats.state_dict() | {
-            "stats.gradient": self._gradient,
-            "stats.count": self._count,
-            "stats.radius_px": self._radius,
+            "stats.gradient": self._measured.gradient,
+            "stats.count": self._measured.count,
+            "stats.radius_px": self._measured.radius,
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Takes over what `state_dict` gave; the number of Gaussians may differ."""
         self.splats.load_state_dict(state)
-        self._gradient, self._count, self._radius = (
-            state[f"stats.{name}"].to(self.splats.device).clone()
-            for name in ("gradient", "count", "radius_px")
-        )
+        names = ("gradient", "count", "radius_px")
+        self._measured = Measured(*(state[f"stats.{x}"].to(self.splats.device).clone() for x in names))
 
     def _measure(self, render: Render) -> None:
-        info = render.info
-        # In normalised device units. Numbers, not a tensor: a copy to the GPU would wait for it.
-        u, v = info["means2d"].grad.unbind(-1)
-        norm = torch.stack([u * (info["width"] / 2), v * (info["height"] / 2)], -1).norm(dim=-1)
-        visible = info["visible"]
-        self._gradient = self._gradient + torch.where(visible, norm, 0)
-        self._count = self._count + visible
-        radii = info["radii"] if info["radii"].ndim == 1 else info["radii"].amax(-1)
-        largest = self.schedule.largest
+        info, largest = render.info, self.schedule.largest
         in_pixels = largest is not None and largest.radius_px is not None
-        unit = 1 if in_pixels else max(info["width"], info["height"])
-        self._radius = torch.maximum(self._radius, torch.where(visible, radii, 0).float() / unit)
+        self._measured = self._measured.after(info, 1 if in_pixels else max(info["width"], info["height"]))
 
     def _densify(self, done: int) -> None:
         """Clones, splits and prunes by what was measured since the last time."""
         splats, c = self.splats, self.splats.config
         p = {name: value.detach() for name, value in splats.optimiser.parameters.items()}
-        grow = self._gradient / self._count.clamp_min(1) >= c.densify_gradient
+        grow = self._measured.gradient / self._measured.count.clamp_min(1) >= c.densify_gradient
         if len(splats) >= c.max_gaussians:
             grow = torch.zeros_like(grow)
         largest_scale = p["log_scales"].exp().amax(-1)
@@ -197,7 +183,7 @@ class Strategy:
         start, largest = self.schedule.prune_large_from, self.schedule.largest
         faint = int(gone.sum()) - len(children["means"]) // 2
         if prunes and start is not None and largest is not None and done > start:
-            on_screen = torch.cat([self._radius, self._radius.new_zeros(new)])
+            on_screen = torch.cat([self._measured.radius, largest_scale.new_zeros(new)])
             in_space = shown.log_scales.exp().amax(-1)
             gone |= on_screen > (largest.radius if largest.radius_px is None else largest.radius_px)
             gone |= in_space > largest.scale * splats.extent
@@ -207,7 +193,7 @@ class Strategy:
                 int(gone.sum()) - faint - len(children["means"]) // 2
             )
             splats.optimiser.keep(~gone)
-        self._gradient = self._count = self._radius = torch.zeros(len(splats), device=splats.device)
+        self._measured = Measured.nothing(len(splats), splats.device)
 
     def _unpool(self, unpooling: Unpooling, split: Tensor) -> None:
         """Adds Gaussians between those that are far apart; the first ones, where `split` is True, are on their way
