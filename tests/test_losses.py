@@ -1,10 +1,13 @@
 """Losses by their definitions."""
 
+import itertools
 import math
+from functools import partial
 
 import pytest
 import torch
 
+from visdom_plugin import losses
 from visdom_plugin.hooks.regularizer import outside_loss
 from visdom_plugin.losses import below_one, composite_target, disparity_loss, mask_loss, photometric_loss
 from visdom_plugin.nerf.rendering.volume import weights_from_density
@@ -179,3 +182,54 @@ def test_an_unknown_mask_asks_for_colour_and_for_no_opacity():
     assert torch.equal(
         composite_target(image, mask, background), composite_target(image, mask, background, mask_known=True)
     )
+
+
+def opacities(n, dtype):
+    """Of all sizes, those near 0 and 1 among them."""
+    draw = torch.Generator().manual_seed(n)
+    spread = torch.rand(n, generator=draw, dtype=torch.float64) ** 4
+    alpha = torch.where(torch.rand(n, generator=draw) < 0.5, spread, 1 - 1e-3 * spread)
+    alpha[: min(n, 3)] = torch.tensor([0.0, 1.0, 1e-9]).double()[: min(n, 3)]
+    return alpha.to(dtype)
+
+
+# Fewer than a vector has, the last vector beginning in the block before, several pieces.
+@pytest.mark.parametrize("n", [5, 16, 1027, 9001])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_kernels_of_losses_are_torchs_with_the_same_gradients_to_the_bit(n, dtype, monkeypatch):
+    alpha, draw = opacities(n, dtype), torch.Generator().manual_seed(n + 1)
+    mask = (torch.rand(n, generator=draw) < 0.5).to(dtype)
+    soft = torch.where(torch.rand(n, generator=draw) < 0.3, mask / 2, mask)
+    weight = (torch.rand(n, generator=draw) < 0.7).to(dtype)
+    settings = itertools.product((mask, soft), (None, weight), (1e-6, 0.1))
+    calls = [partial(mask_loss, mask=m, weight=w, clamp=c) for m, w, c in settings]
+    calls.append(partial(outside_loss, hull_mask=mask.bool()))
+    before = torch.get_num_threads()
+    for call in calls:
+        found = []
+        for threads in (1, 3, 0):
+            with monkeypatch.context() as patch:
+                torch.set_num_threads(threads or 1)
+                if not threads:
+                    patch.setattr(losses, "fills_vectors", lambda alpha: False)
+                at = alpha.clone().requires_grad_()
+                value = 0.7 * call(at)
+                found.append((value.detach(), *torch.autograd.grad(value, at)))
+            torch.set_num_threads(before)
+        one, three, twin = found
+        assert torch.equal(one[0], three[0]) and torch.equal(one[1], three[1])
+        assert torch.equal(one[1], twin[1]) and (n < 16 or one[1].any())
+        torch.testing.assert_close(one[0], twin[0], rtol=2e-6 if dtype == torch.float32 else 1e-13, atol=0)
+
+
+def test_losses_of_opacities_of_which_one_is_not_a_number_are_none():
+    alpha = opacities(2000, torch.float32)
+    alpha[1500] = torch.nan
+    for value in both_losses(alpha):
+        assert value.isnan()
+
+
+def test_very_small_opacities_beside_the_hull_count():
+    alpha = torch.full((40,), 3e-9)
+    outside = outside_loss(alpha, torch.zeros(40).bool())
+    torch.testing.assert_close(outside, torch.tensor(3e-9), rtol=1e-6, atol=0)

@@ -160,7 +160,7 @@ class Cameras:
     def in_units(self, length: float) -> Cameras:
         """The same cameras with positions counted in lengths of that many scene units."""
         motion = self.world_from_camera.clone()
-        motion[..., :3, 3] = (self.centres.double() / length).to(motion)
+        motion[..., :3, 3] = self.centres.double() / length
         return self._hand_size(Cameras(self.intrinsics, motion, self.width, self.height))
 
     def resized(self, width, height) -> Cameras:

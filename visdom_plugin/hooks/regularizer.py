@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from torch import Generator, Tensor
-from torch.autograd.function import FunctionCtx, once_differentiable
+from torch.autograd.function import once_differentiable
 
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.camera_paths import draw_between
@@ -24,7 +24,7 @@ from visdom_plugin.hull.hull import Hull
 from visdom_plugin.hull.queries.point_colours import check_images, colour_points
 from visdom_plugin.hull.queries.raycast import depth_and_silhouette
 from visdom_plugin.hull.queries.shell_points import sample_shell, voxel_centres
-from visdom_plugin.losses import OPAQUE
+from visdom_plugin.losses import outside_sum
 
 log = logging.getLogger(__name__)
 
@@ -50,16 +50,16 @@ class _Outside(torch.autograd.Function):
     """The loss in fewer kernels than autograd makes of it; `losses.below_one` says what happens at 1."""
 
     @staticmethod
-    def forward(ctx: FunctionCtx, alpha: Tensor, hull_mask: Tensor) -> Tensor:
-        bounded = alpha.clamp_max(OPAQUE)
-        ctx.save_for_backward(bounded, hull_mask)
-        return -bounded.neg().log1p_().masked_fill_(hull_mask, 0).mean()
+    def forward(ctx: Any, alpha: Tensor, hull_mask: Tensor) -> Tensor:
+        total, room = outside_sum(alpha, hull_mask)
+        ctx.save_for_backward(room)
+        return total / room.numel()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None]:
-        bounded, hull_mask = ctx.saved_tensors
-        return (slope / bounded.numel() / (1 - bounded)).masked_fill_(hull_mask, 0), None
+        (room,) = ctx.saved_tensors
+        return slope / room.numel() / room, None
 
 
 class Opacity(Protocol):

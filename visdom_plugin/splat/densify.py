@@ -26,7 +26,7 @@ class Measured(NamedTuple):
 
     gradient: Tensor
     """(N,) sum of the norms of the loss's gradient by the projected mean, in normalised device units."""
-    count: Tensor
+    seen: Tensor
     """(N,) in how many steps it was visible."""
     radius: Tensor
     """(N,) the largest on screen, in `unit`."""
@@ -63,7 +63,7 @@ class Measured(NamedTuple):
         radii = radii if radii.ndim == 1 else radii.amax(-1)
         return Measured(
             self.gradient + torch.where(visible, norm, 0),
-            self.count + visible,
+            self.seen + visible,
             torch.maximum(self.radius, torch.where(visible, radii, 0).float() / unit),
         )
 

@@ -42,6 +42,7 @@ class DataManager:
         self._starts, self._ends = ends[:-1].to(self.device), ends[1:].to(self.device)
         self._known = None if all(self._mask_known) else torch.tensor(self._mask_known, device=self.device)
         self._drawable: Tensor | None = None
+        self._order: tuple[int, list[int]] = -1, []  # of the views in a pass over them
         self._flat: tuple[Tensor, Tensor] | None = None
 
     def __len__(self) -> int:
@@ -50,8 +51,10 @@ class DataManager:
     def view_index(self, step: int) -> int:
         """The view of a step: every pass over the views is a permutation of its own."""
         epoch, position = divmod(step, len(self))
-        order = torch.randperm(len(self), generator=generator(self.seed, "views", epoch))
-        return int(order[position])
+        if self._order[0] != epoch:
+            order = torch.randperm(len(self), generator=generator(self.seed, "views", epoch))
+            self._order = epoch, order.tolist()
+        return self._order[1][position]
 
     def view_batch(self, step: int) -> ViewBatch:
         """The whole view of a step."""

@@ -127,7 +127,7 @@ class Strategy:
     def after_step(self, hooks: Sequence[GaussianHook], step: int) -> None:
         """Removes the Gaussians that hooks mark."""
         for hook in hooks:
-            self.remove(hook.after_step(self.splats.in_scene(), step), "outside the hull")
+            self.remove(hook.after_step(self.splats, step), "outside the hull")
 
     def remove(self, gone: Tensor | None, why: str) -> None:
         """Removes Gaussians where `gone` (N,) bool is True; all of them, or None, and it removes none."""
@@ -141,7 +141,7 @@ class Strategy:
         """The set's parameters and moments, and the measurements, as a flat dict of tensors."""
         return self.splats.state_dict() | {
             "stats.gradient": self._measured.gradient,
-            "stats.count": self._measured.count,
+            "stats.count": self._measured.seen,
             "stats.radius_px": self._measured.radius,
         }
 
@@ -160,7 +160,7 @@ class Strategy:
         """Clones, splits and prunes by what was measured since the last time."""
         splats, c = self.splats, self.splats.config
         p = {name: value.detach() for name, value in splats.optimiser.parameters.items()}
-        grow = self._measured.gradient / self._measured.count.clamp_min(1) >= c.densify_gradient
+        grow = self._measured.gradient / self._measured.seen.clamp_min(1) >= c.densify_gradient
         if len(splats) >= c.max_gaussians:
             grow = torch.zeros_like(grow)
         largest_scale = p["log_scales"].exp().amax(-1)
