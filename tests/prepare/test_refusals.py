@@ -43,7 +43,7 @@ def test_no_board(folder, tmp_path, capsys):
         save(folder, f"{i}.jpg")
     said = refusal(folder, tmp_path, capsys)
     assert "no board (7 x 10 squares, markers 4X4_50) was found in any of 3 photographs" in said
-    assert "--print-board" in said and str(folder) in said
+    assert "--print-board" in said and "--poses" in said and str(folder) in said
 
 
 def test_another_dictionary_is_named(photographs, tmp_path, capsys):

@@ -108,7 +108,8 @@ def _refuse(photographs: Sequence[Photograph], found: Sequence[Corners], setting
         todo = "give the board's own --squares; try --legacy for one made by OpenCV before 4.6"
     else:
         cause = "the photographs show no board, or it is too small, too blurred or behind the object"
-        todo = "print the board (visdom-prepare --print-board board.pdf) and lay it under the object"
+        todo = "print the board (visdom-prepare --print-board board.pdf) and lay it under the object; or pass the "
+        todo += "poses of another program: --poses FILE"
     raise SceneError(
         f"no board ({board}) was found in any of {len(photographs)} photographs",
         where=f"{photographs[0].path.parent}: {list_some(p.name for p in photographs)}",

@@ -1,6 +1,7 @@
 """visdom-export on files of Gaussians: conversions, and what cannot be converted."""
 
 import json
+import shlex
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from tests.splat.twin import make_gaussians
 from visdom_plugin.cli.commands import export
+from visdom_plugin.cli.output.terminal import show_next
 from visdom_plugin.export.splat_files import read_near, read_splats
 from visdom_plugin.splat.ply import write_gaussians
 
@@ -61,3 +63,16 @@ def test_bad_input_gets_one_clear_line(tmp_path, gaussians, capsys):
         assert export.main(words) == 2
         assert said in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.ply", "broken.ply", "empty"]
+
+
+@pytest.mark.parametrize("file", ["point_cloud.ply", "mesh.ply"])
+def test_the_export_that_training_ends_with_is_one_that_the_run_can_have(file, tmp_path, capsys, monkeypatch):
+    (tmp_path / "export").mkdir()
+    (tmp_path / "export" / file).touch()
+    (tmp_path / "run.json").write_text(json.dumps({"schema": 1, "status": "finished", "method": "m"}))
+    show_next(tmp_path)
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "visdom-export" in line]
+    written = []
+    for name in ("_write_splats", "_write_mesh"):
+        monkeypatch.setattr(export, name, lambda options, target: written.append(target) or [])
+    assert export.main(shlex.split(said, comments=True)[1:]) == 0 and len(written) == 1

@@ -148,6 +148,19 @@ def test_files_that_cannot_be_read(name, content, said, taken, tmp_path):
         place_by_file(tmp_path / name, find_photographs(taken.folder)[0])
 
 
+def test_the_folder_above_a_colmap_model_will_do_where_it_holds_one(taken, tmp_path):
+    photographs = find_photographs(taken.folder)[0]
+    for name in ("sparse/0", "models/first"):
+        (tmp_path / name).parent.mkdir()
+        exports.colmap(tmp_path / name, taken.cameras)
+        placed = place_by_file((tmp_path / name).parent, photographs)
+        assert [p.name for p in placed.photographs] == [c.name for c in taken.cameras]
+    exports.colmap(tmp_path / "sparse/1", taken.cameras)
+    with pytest.raises(SceneError, match="2 COLMAP models") as caught:
+        place_by_file(tmp_path / "sparse", photographs)
+    assert f"--poses {tmp_path / 'sparse/0'}, --poses {tmp_path / 'sparse/1'}" in caught.value.todo
+
+
 def test_a_square_copy_of_unknown_crop_is_refused(taken, tmp_path):
     exports.vggt(tmp_path / "p.npz", taken.cameras, pad=True)
     with np.load(tmp_path / "p.npz") as arrays:

@@ -347,8 +347,8 @@ def summarise_fit(report: dict[str, Any]) -> list[str]:
         f"Apart from what was found, m{missed}." if report["findings"] else f"M{missed}; 0 is a perfect fit."
     )
     lines.append(
-        f"Right beside each mask, the other masks rule the object out by {report['constraint']:.1%} of its "
-        "size on average; the more, the smaller a wrong pose that they notice."
+        f"Sensitivity to wrong poses: {report['constraint']:.1%} of the object's size, by which the other masks "
+        "exclude it right beside each mask; the higher, the smaller an error that shows."
     )
     return lines
 

@@ -65,7 +65,11 @@ def show_next(folder: Path) -> None:
     say(f"next: open {page}" if page.exists() else f"next: visdom-report {run}")
     say(f"      visdom-view {run}                  # in the browser, beside the photographs")
     say(f"      visdom-render {run} --path orbit   # a flight around it")
-    say(f"      visdom-export {run} --format html --upright  # one file to send; also glb, obj, spz and more")
+    splat = (folder / "export" / "point_cloud.ply").exists()
+    form, what = (
+        ("html", "one page to send; also glb, obj, spz and more") if splat else ("glb", "a mesh; also obj")
+    )
+    say(f"      visdom-export {run} --format {form} --upright  # {what}")
 
 
 def show_oracle(record: dict[str, Any]) -> None:

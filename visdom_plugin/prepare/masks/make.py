@@ -73,7 +73,8 @@ def cut_views(
         plane: whether the box stands on a plane that the views show, as a board on a table.
         rounds: of correction by the hull.
     """
-    with counting("making masks", (3 + rounds) * len(images)) as count:
+    passes = 3 + rounds
+    with counting(f"making masks in {passes} passes", passes * len(images)) as count:
         masks, copies = _cut_together(cameras, images, names, box, plane, rounds, count)
 
         def whole(i: int) -> np.ndarray:

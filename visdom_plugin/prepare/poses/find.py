@@ -94,14 +94,26 @@ def _read_folder(path: Path, photographs: Sequence[Photograph]) -> Listed | Capt
         listed = phones.read_folder(files, photographs)
         if listed is not None:
             return listed
-    raise _unknown(path)
+    # COLMAP's `sparse`, which holds models by number.
+    models = [below for below in sorted(path.iterdir()) if below.is_dir() and find_model(below) is not None]
+    if len(models) == 1:
+        return _read_folder(models[0], photographs)
+    raise _unknown(path, models)
 
 
-def _unknown(path: Path) -> SceneError:
+def _unknown(path: Path, models: Sequence[Path] = ()) -> SceneError:
+    where = f"--poses {path}"
+    if models:
+        return SceneError(
+            f"there are {len(models)} COLMAP models in this folder",
+            where=where,
+            todo=f"name one, as a rule the one of most photographs: {list_some(f'--poses {m}' for m in models)}",
+            topic="layout",
+        )
     inside = f"; it holds {list_some(sorted(p.name for p in path.iterdir()))}" if path.is_dir() else ""
     return SceneError(
         f"these poses are of no format that is read{inside}",
-        where=f"--poses {path}",
+        where=where,
         cause="a project file in place of an export, or the folder above or below",
         todo=f"export one of: {_KNOWN}",
         topic="layout",
