@@ -181,7 +181,7 @@ def _refuse_few_views(
                 raise ConfigError(
                     error.what,
                     where=f"row {label!r} and column {column.label!r} of {spec.source}",
-                    todo="change the row's hull.k or the column's views; or run the other rows alone, with --only",
+                    todo="more views (`views` there, or --views), a smaller hull.k, or --only with other rows",
                     topic=error.topic,
                 ) from error
 
