@@ -80,7 +80,6 @@ def main() -> None:
     clock = Clock()
     for module in (backend, tiles, ssim):
         clock.around(module, "parallel_for")
-    clock.around(tiles, "sort_by_depth", "sort by depth, one thread")
     clock.around(optimisers.adam, "update", "Adam")
     sizes = [tuple(map(int, size.split("x"))) for size in arguments.sizes]
     columns = [

@@ -150,8 +150,8 @@ def test_gradients_of_several_renders_add_up():
 
 def test_warm_up_leaves_nothing_to_compile():
     kernels = [
-        projection.project, projection.project_backward, tiles._list, tiles._start, tiles._fill,
-        tiles._radix_order, blending.blend, blending.blend_backward, blending.gather,
+        projection.project, projection.project_backward, tiles._sort_chunks, tiles._choose_bounds, tiles._list,
+        tiles._start, tiles._fill, blending.blend, blending.blend_backward, blending.gather,
     ]  # fmt: skip
     backend.warm_up()
     before = [len(kernel.signatures) for kernel in kernels]

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.splat.twin import make_camera, make_gaussians
-from visdom_plugin.splat.cpu import backend, tiles
+from visdom_plugin.splat.cpu import backend
 from visdom_plugin.splat.cpu.tiles import TILE, Tiles
 from visdom_plugin.splat.rasterise import rasterise
 
@@ -78,11 +78,22 @@ def test_both_orders_name_the_same_intersections(monkeypatch):
         assert (np.diff(records[found.gaussians[start:end], 7]) >= 0).all()
 
 
-def test_radix_order_is_stable():
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("n", [0, 1, 40, 3000])
+def test_order_by_depth_is_stable(n, dtype):
     generator = np.random.default_rng(0)
-    for dtype in (np.float32, np.float64):
-        depths = generator.choice([0, 1e-3, 0.5, 0.5000001, 3, 1e20], 500).astype(dtype)
-        assert (tiles.sort_by_depth(depths) == np.argsort(depths, kind="stable")).all()
+    some = generator.choice([0, 1e-3, 0.5, 0.5000001, 3, 1e20, np.inf], n)
+    for depths in (
+        some,
+        np.zeros(n),
+        np.full(n, 3.0),
+        generator.random(n),
+        np.where(some > 2, 0, generator.random(n)),
+    ):
+        splats = np.zeros((n, 16), dtype)  # none is drawn
+        splats[:, 7] = depths
+        found = Tiles(splats, np.zeros(n, np.int32), 40, 30)
+        assert (found.order == np.argsort(splats[:, 7], kind="stable")).all()
 
 
 @pytest.mark.parametrize("threads", [2, 3])

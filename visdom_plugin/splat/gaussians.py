@@ -38,7 +38,7 @@ class Gaussians:
 
     def tensors(self) -> dict[str, Tensor]:
         """The parameters by name, in the order of the fields."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: getattr(self, name) for name in NAMES}
 
     def to(self, device=None, dtype: torch.dtype | None = None) -> Gaussians:
         """The same Gaussians on another device or in another floating dtype."""
@@ -47,3 +47,6 @@ class Gaussians:
     def detach(self) -> Gaussians:
         """The same numbers outside the graph."""
         return Gaussians(**{k: v.detach() for k, v in self.tensors().items()})
+
+
+NAMES = tuple(f.name for f in fields(Gaussians))

@@ -37,14 +37,14 @@ def rasterise_cpu(
     if means2d.requires_grad:
         means2d.retain_grad()
     rgb, alpha, depth = _Blend.apply(means2d, splats, tiles, background, width, height)
-    conics, _, colours, depths, _ = splats.detach().split((3, 1, 3, 1, projection.RECORD - 8), 1)
+    records = splats.detach().numpy()
     info = {
         "means2d": means2d,
         "radii": radii,
         "visible": visible,
-        "conics": conics,
-        "colours": colours,
-        "depths": depths.squeeze(1),
+        "conics": torch.from_numpy(records[:, :3]),
+        "colours": torch.from_numpy(records[:, 4:7]),
+        "depths": torch.from_numpy(records[:, 7]),
         "width": width,
         "height": height,
     }

@@ -25,7 +25,9 @@ TILE = 16
 """Edge of a tile in pixels."""
 
 CHUNKS = 32
-"""Parts of the Gaussians, by depth, that are sorted into tiles on their own."""
+"""Parts of the Gaussians that are sorted by depth on their own, and parts by depth that are sorted into tiles."""
+SAMPLES = 16
+"""Depths of a chunk, of those by which the parts by depth are chosen."""
 
 
 class Tiles:
@@ -45,54 +47,148 @@ class Tiles:
         n = len(splats)
         self.columns, lines = -(-width // TILE), -(-height // TILE)
         self.count = self.columns * lines
-        self.order = sort_by_depth(splats[:, 7])
-        self.offsets = np.zeros(n + 1, np.int64)
-        np.cumsum(counts[self.order], out=self.offsets[1:])
-        total = int(self.offsets[-1])
-        slot_tiles, slot_rows = np.empty(total, np.int32), np.empty(total, np.int16)
-        cursors = np.zeros((CHUNKS, self.count), np.int32)
+        bits = splats.view(np.uint32 if splats.dtype == np.float32 else np.uint64)
         size = max(-(-n // CHUNKS), 1)
+        own, keys = np.empty(n, np.int32), np.empty(n, bits.dtype)
+        ahead, totals = np.empty(n, np.int64), np.empty(CHUNKS, np.int64)
+        parallel_for(_sort_chunks, CHUNKS, 1, size, bits, counts, own, keys, ahead, totals)
+        total = int(totals.sum())
+        bounds = np.empty(CHUNKS + 1, bits.dtype)
+        _choose_bounds(keys, size, bounds)
+        self.order, self.offsets = np.empty(n, np.int32), np.empty(n + 1, np.int64)
+        self.offsets[n] = total
+        slot_tiles, slot_rows = np.empty(total, np.int32), np.empty(total, np.int16)
+        cursors, ranks = np.empty((CHUNKS, self.count), np.int32), np.empty(CHUNKS + 1, np.int64)
+        ranks[CHUNKS] = n
         parallel_for(
-            _list, CHUNKS, 1, size, self.order, splats, width, height, self.offsets, slot_tiles, slot_rows,
-            cursors,
+            _list, CHUNKS, 1, size, own, keys, ahead, totals, bounds, counts, splats, width, height,
+            self.order, self.offsets, ranks, slot_tiles, slot_rows, cursors,
         )  # fmt: skip
-        self.starts = np.zeros(self.count + 1, np.int32)
+        self.starts = np.empty(self.count + 1, np.int32)
         _start(cursors, self.starts)
         self.gaussians, self.slots = np.empty(total, np.int32), np.empty(total, np.int32)
         self.rows = np.empty(total, np.int16)
         parallel_for(
-            _fill, CHUNKS, 1, size, self.order, self.offsets, slot_tiles, slot_rows, cursors,
+            _fill, CHUNKS, 1, ranks, self.order, self.offsets, slot_tiles, slot_rows, cursors,
             self.gaussians, self.slots, self.rows,
         )  # fmt: skip
 
 
-def sort_by_depth(depths: np.ndarray) -> np.ndarray:
-    """Stable order (N,) int32 of depths (N,) >= 0, float32 or float64: a radix sort on the bits."""
-    bits = np.ascontiguousarray(depths).view(np.uint32 if depths.dtype == np.float32 else np.uint64)
-    return _radix_order(bits, 3 if depths.dtype == np.float32 else 6)
+@kernel()
+def _sort(keys, order, first, last):
+    """Sorts numbers first .. last - 1 of both arrays by their keys, stably: a radix sort by bytes.
+
+    Keys are bits of numbers >= 0. Bytes in which all but those of 0 agree are left out.
+    """
+    n = last - first
+    low, high = ~np.uint64(0), np.uint64(0)
+    for i in range(first, last):
+        high = max(high, np.uint64(keys[i]))
+        low = min(low, np.uint64(keys[i]) + ~np.uint64(0)) if keys[i] else low
+    # `low` is one less than the least above 0.
+    these, others = (keys[first:last], order[first:last]), (np.empty(n, keys.dtype), np.empty(n, np.int32))
+    places = np.empty(256, np.int64)
+    shift, left = np.uint64(0), high - low if high else np.uint64(0)
+    passes = 0
+    while left:
+        (a, names), (b, moved) = these, others
+        for j in range(256):
+            places[j] = 0
+        for i in range(n):
+            places[_byte(a[i], low, shift)] += 1
+        at = 0
+        for j in range(256):
+            at, places[j] = at + places[j], at
+        for i in range(n):
+            place = places[_byte(a[i], low, shift)]
+            places[_byte(a[i], low, shift)] = place + 1
+            b[place], moved[place] = a[i], names[i]
+        these, others = others, these
+        shift += np.uint64(8)
+        left >>= np.uint64(8)
+        passes += 1
+    if passes % 2:
+        for i in range(n):
+            others[0][i], others[1][i] = these[0][i], these[1][i]
+
+
+@kernel(inline="always")
+def _byte(key, low, shift):
+    """Of what a key is more than `low`; of nothing for the key 0."""
+    return ((np.uint64(key) - low) * np.uint64(key > 0) >> shift) & np.uint64(255)
 
 
 @kernel()
-def _radix_order(keys, digits):
-    n = len(keys)
-    order, other = np.empty(n, np.int32), np.empty(n, np.int32)
-    counts = np.empty(2049, np.int64)
-    for i in range(n):
-        order[i] = i
-    for digit in range(digits):
-        shift = 11 * digit
-        for j in range(2049):
-            counts[j] = 0
-        for i in range(n):
-            counts[((np.uint64(keys[i]) >> np.uint64(shift)) & np.uint64(2047)) + np.uint64(1)] += 1
-        for j in range(2048):
-            counts[j + 1] += counts[j]
-        for i in range(n):
-            bucket = (np.uint64(keys[order[i]]) >> np.uint64(shift)) & np.uint64(2047)
-            other[counts[bucket]] = order[i]
-            counts[bucket] += 1
-        order, other = other, order
-    return order
+def _sort_chunks(begin, end, size, bits, counts, own, keys, ahead, totals):
+    """Sorts the Gaussians of chunks begin .. end - 1 by depth: writes which they are and their keys.
+
+    `ahead` (N,) are the tiles that those before one in its chunk meet, `totals` (CHUNKS,) those of a chunk.
+    """
+    n = len(own)
+    for chunk in range(begin, end):
+        first, last = min(chunk * size, n), min((chunk + 1) * size, n)
+        for i in range(first, last):
+            own[i], keys[i] = i, bits[i, 7]
+        _sort(keys, own, first, last)
+        total = 0
+        for i in range(first, last):
+            ahead[i] = total
+            total += counts[own[i]]
+        totals[chunk] = total
+
+
+@kernel()
+def _first_from(keys, first, last, key):
+    """The first place of sorted keys that holds no smaller one than `key`."""
+    while first < last:
+        middle = (first + last) // 2
+        if keys[middle] < key:
+            first = middle + 1
+        else:
+            last = middle
+    return first
+
+
+@kernel()
+def _choose_bounds(keys, size, bounds):
+    """Finds keys (CHUNKS + 1,) between which lie parts of about as many Gaussians each; keys are sorted in chunks.
+
+    What is not drawn has the key 0 and a part of its own. No result depends on the bounds.
+    """
+    step = max(size // SAMPLES, 1)
+    samples = keys[::step].copy()
+    count = len(samples)
+    _sort(samples, np.empty(count, np.int32), 0, count)
+    first = _first_from(samples, 0, count, keys.dtype.type(1))
+    bounds[0], bounds[1], bounds[CHUNKS] = 0, 1, ~keys.dtype.type(0)
+    for part in range(2, CHUNKS):
+        bounds[part] = samples[first + (part - 1) * (count - first) // (CHUNKS - 1)] if first < count else 1
+
+
+@kernel()
+def _merge(part, size, own, keys, ahead, totals, bounds, counts, order, offsets, ranks):
+    """Sorts a part by depth, of what all chunks have of it, and finds its slots; returns its ranks."""
+    n = len(own)
+    starts, ends = np.empty(CHUNKS, np.int64), np.empty(CHUNKS, np.int64)
+    rank, slot, count = 0, 0, 0
+    for chunk in range(CHUNKS):
+        first, last = min(chunk * size, n), min((chunk + 1) * size, n)
+        starts[chunk] = _first_from(keys, first, last, bounds[part])
+        ends[chunk] = _first_from(keys, starts[chunk], last, bounds[part + 1])
+        rank += starts[chunk] - first
+        slot += ahead[starts[chunk]] if starts[chunk] < last else totals[chunk]
+        count += ends[chunk] - starts[chunk]
+    depths, at = np.empty(count, keys.dtype), 0
+    for chunk in range(CHUNKS):
+        for i in range(starts[chunk], ends[chunk]):
+            depths[at], order[rank + at] = keys[i], own[i]
+            at += 1
+    _sort(depths, order[rank : rank + count], 0, count)
+    for i in range(rank, rank + count):
+        offsets[i] = slot
+        slot += counts[order[i]]
+    ranks[part] = rank
+    return rank, rank + count
 
 
 @kernel(error_model="numpy")
@@ -158,16 +254,21 @@ def count_tiles(s, at, width, height):
 
 
 @kernel(error_model="numpy")
-def _list(begin, end, size, order, splats, width, height, offsets, slot_tiles, slot_rows, counts):
-    """Writes tile and rows of the slots of chunks begin .. end - 1, and how many slots of each lie in a tile."""
+def _list(
+    begin, end, size, own, keys, ahead, totals, bounds, met, splats, width, height,
+    order, offsets, ranks, slot_tiles, slot_rows, counts,
+):  # fmt: skip
+    """Sorts parts begin .. end - 1; writes tile and rows of their slots, and how many of each lie in a tile."""
     columns = (width + TILE - 1) // TILE
     s = scratch(splats, WIDTH * 19)
     tops, bottoms, lines = WIDTH * 16, WIDTH * 17, WIDTH * 18
     rows = scratch(splats, WIDTH * WIDTH)
     slots = np.empty(WIDTH, np.int64)
     for chunk in range(begin, end):
-        finish = min((chunk + 1) * size, len(order))
-        for start in range(chunk * size, finish, WIDTH):
+        for tile in range(counts.shape[1]):
+            counts[chunk, tile] = 0
+        rank, finish = _merge(chunk, size, own, keys, ahead, totals, bounds, met, order, offsets, ranks)
+        for start in range(rank, finish, WIDTH):
             count = min(finish - start, WIDTH)
             for lane in range(WIDTH):
                 rank = start + min(lane, count - 1)
@@ -210,9 +311,9 @@ def _start(cursors, starts):
 
 
 @kernel()
-def _fill(begin, end, size, order, offsets, slot_tiles, slot_rows, cursors, gaussians, slots, rows):
+def _fill(begin, end, ranks, order, offsets, slot_tiles, slot_rows, cursors, gaussians, slots, rows):
     for chunk in range(begin, end):
-        for rank in range(min(chunk * size, len(order)), min((chunk + 1) * size, len(order))):
+        for rank in range(ranks[chunk], ranks[chunk + 1]):
             for slot in range(offsets[rank], offsets[rank + 1]):
                 place = cursors[chunk, slot_tiles[slot]]
                 cursors[chunk, slot_tiles[slot]] = place + 1
