@@ -150,7 +150,7 @@ def test_gradients_of_several_renders_add_up():
 
 def test_warm_up_leaves_nothing_to_compile():
     kernels = [
-        projection.project, projection.project_backward, tiles._sort_chunks, tiles._choose_bounds, tiles._list,
+        projection.project, projection.project_backward, tiles._sort_chunks, tiles._list,
         tiles._start, tiles._fill, blending.blend, blending.blend_backward, blending.gather,
     ]  # fmt: skip
     backend.warm_up()

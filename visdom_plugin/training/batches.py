@@ -66,7 +66,7 @@ class DataManager:
         return ViewBatch(
             index,
             self._each[index],
-            self._images[index].float() / 255,
+            self._images[index].float().div_(255),
             self._masks[index].float(),
             self._depths[index] if self._depths else None,
             None if counted is None else counted.float(),

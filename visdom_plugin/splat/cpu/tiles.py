@@ -26,7 +26,7 @@ TILE = 16
 
 CHUNKS = 32
 """Parts of the Gaussians that are sorted by depth on their own, and parts by depth that are sorted into tiles."""
-SAMPLES = 16
+SAMPLES = 8
 """Depths of a chunk, of those by which the parts by depth are chosen."""
 
 
@@ -53,15 +53,13 @@ class Tiles:
         ahead, totals = np.empty(n, np.int64), np.empty(CHUNKS, np.int64)
         parallel_for(_sort_chunks, CHUNKS, 1, size, bits, counts, own, keys, ahead, totals)
         total = int(totals.sum())
-        bounds = np.empty(CHUNKS + 1, bits.dtype)
-        _choose_bounds(keys, size, bounds)
         self.order, self.offsets = np.empty(n, np.int32), np.empty(n + 1, np.int64)
         self.offsets[n] = total
         slot_tiles, slot_rows = np.empty(total, np.int32), np.empty(total, np.int16)
         cursors, ranks = np.empty((CHUNKS, self.count), np.int32), np.empty(CHUNKS + 1, np.int64)
         ranks[CHUNKS] = n
         parallel_for(
-            _list, CHUNKS, 1, size, own, keys, ahead, totals, bounds, counts, splats, width, height,
+            _list, CHUNKS, 1, size, own, keys, ahead, totals, _bounds(keys, size), counts, splats, width, height,
             self.order, self.offsets, ranks, slot_tiles, slot_rows, cursors,
         )  # fmt: skip
         self.starts = np.empty(self.count + 1, np.int32)
@@ -74,42 +72,63 @@ class Tiles:
         )  # fmt: skip
 
 
+def _bounds(keys: np.ndarray, size: int) -> np.ndarray:
+    """Keys (CHUNKS + 1,) between which lie parts of about as many Gaussians each; keys are sorted in chunks.
+
+    What is not drawn has the key 0 and a part of its own. No result depends on the bounds.
+    """
+    samples = keys[:: max(size // SAMPLES, 1)].copy()
+    samples.sort()
+    samples = samples[samples.searchsorted(1) :]
+    bounds = np.empty(CHUNKS + 1, keys.dtype)
+    bounds[0], bounds[-1] = 0, np.iinfo(keys.dtype).max
+    bounds[1:-1] = 1
+    if len(samples):
+        bounds[2:-1] = samples[_WITHIN * len(samples) // (CHUNKS - 1)]
+    return bounds
+
+
+_WITHIN = np.arange(1, CHUNKS - 1)
+
+
 @kernel()
-def _sort(keys, order, first, last):
-    """Sorts numbers first .. last - 1 of both arrays by their keys, stably: a radix sort by bytes.
+def _sort(keys, order):
+    """Sorts both arrays by the keys, stably: a radix sort by bytes.
 
     Keys are bits of numbers >= 0. Bytes in which all but those of 0 agree are left out.
     """
-    n = last - first
-    low, high = ~np.uint64(0), np.uint64(0)
-    for i in range(first, last):
+    n = len(keys)
+    low, high = ~np.uint64(0), np.uint64(0)  # one less than the least above 0, and the largest
+    for i in range(n):
         high = max(high, np.uint64(keys[i]))
         low = min(low, np.uint64(keys[i]) + ~np.uint64(0)) if keys[i] else low
-    # `low` is one less than the least above 0.
-    these, others = (keys[first:last], order[first:last]), (np.empty(n, keys.dtype), np.empty(n, np.int32))
+    a, names, b, moved = keys, order, np.empty_like(keys), np.empty_like(order)
     places = np.empty(256, np.int64)
     shift, left = np.uint64(0), high - low if high else np.uint64(0)
-    passes = 0
     while left:
-        (a, names), (b, moved) = these, others
         for j in range(256):
             places[j] = 0
         for i in range(n):
             places[_byte(a[i], low, shift)] += 1
         at = 0
         for j in range(256):
-            at, places[j] = at + places[j], at
+            count = places[j]
+            places[j] = at
+            at += count
         for i in range(n):
-            place = places[_byte(a[i], low, shift)]
-            places[_byte(a[i], low, shift)] = place + 1
-            b[place], moved[place] = a[i], names[i]
-        these, others = others, these
+            byte = _byte(a[i], low, shift)
+            place = places[byte]
+            places[byte] = place + 1
+            b[place] = a[i]
+            moved[place] = names[i]
+        a, names, b, moved = b, moved, a, names
         shift += np.uint64(8)
         left >>= np.uint64(8)
-        passes += 1
-    if passes % 2:
+    # After an odd number of bytes the result is in the other arrays.
+    if shift & np.uint64(8):
         for i in range(n):
-            others[0][i], others[1][i] = these[0][i], these[1][i]
+            keys[i] = a[i]
+            order[i] = names[i]
 
 
 @kernel(inline="always")
@@ -129,7 +148,7 @@ def _sort_chunks(begin, end, size, bits, counts, own, keys, ahead, totals):
         first, last = min(chunk * size, n), min((chunk + 1) * size, n)
         for i in range(first, last):
             own[i], keys[i] = i, bits[i, 7]
-        _sort(keys, own, first, last)
+        _sort(keys[first:last], own[first:last])
         total = 0
         for i in range(first, last):
             ahead[i] = total
@@ -150,22 +169,6 @@ def _first_from(keys, first, last, key):
 
 
 @kernel()
-def _choose_bounds(keys, size, bounds):
-    """Finds keys (CHUNKS + 1,) between which lie parts of about as many Gaussians each; keys are sorted in chunks.
-
-    What is not drawn has the key 0 and a part of its own. No result depends on the bounds.
-    """
-    step = max(size // SAMPLES, 1)
-    samples = keys[::step].copy()
-    count = len(samples)
-    _sort(samples, np.empty(count, np.int32), 0, count)
-    first = _first_from(samples, 0, count, keys.dtype.type(1))
-    bounds[0], bounds[1], bounds[CHUNKS] = 0, 1, ~keys.dtype.type(0)
-    for part in range(2, CHUNKS):
-        bounds[part] = samples[first + (part - 1) * (count - first) // (CHUNKS - 1)] if first < count else 1
-
-
-@kernel()
 def _merge(part, size, own, keys, ahead, totals, bounds, counts, order, offsets, ranks):
     """Sorts a part by depth, of what all chunks have of it, and finds its slots; returns its ranks."""
     n = len(own)
@@ -183,7 +186,7 @@ def _merge(part, size, own, keys, ahead, totals, bounds, counts, order, offsets,
         for i in range(starts[chunk], ends[chunk]):
             depths[at], order[rank + at] = keys[i], own[i]
             at += 1
-    _sort(depths, order[rank : rank + count], 0, count)
+    _sort(depths, order[rank : rank + count])
     for i in range(rank, rank + count):
         offsets[i] = slot
         slot += counts[order[i]]
