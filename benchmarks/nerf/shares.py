@@ -5,8 +5,8 @@ the rest, which is operations of torch, Python and autograd.
     python benchmarks/nerf/shares.py --methods zipnerf-lite ingp+vd --threads 2
 
 The steps are those of `step.py`, with the making of their batch. Times are medians of the last quarter of the
-steps, each part without the parts it calls. Operations of torch are counted in one step afterwards. A part's rest
-is serial but for what torch shares out itself, which is Adam of a large table.
+steps, each part without the parts it calls. Python between the kernels of one launch counts as kernels. Operations
+of torch are counted in one step afterwards. A part's rest is serial.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ PARTS = {
     "hash grids": "encode encode_spread mean_square_per_level",
     "networks": "run_layers encode_harmonics encode_sinusoids density_of padded_sigmoid",
     "weights and compositing": "weights_from_density composite composite_packed",
-    "losses": "mask_loss antialiased_interlevel_loss distortion_loss curve_distances photograph_on psnr_of",
+    "field along rays, at once": "shade",
+    "losses": "ray_losses mask_loss antialiased_interlevel_loss distortion_loss curve_distances photograph_on",
     "occupancy": "update",
     "backward, autograd": "backward",
     "optimiser": "optimise",
@@ -69,7 +70,8 @@ class Clock:
 
         def timed(*arguments, **named):
             if part is None:
-                shared = arguments[1] > arguments[2] and torch.get_num_threads() > 1
+                _, grain, runs = arguments
+                shared = sum(-(-count // grain) for count, _ in runs) > 1 < torch.get_num_threads()
                 here = self.stack[-1][0], KERNELS[1 + shared]
             else:
                 here = part, "rest"
@@ -101,7 +103,8 @@ def watch(clock: Clock) -> None:
     names = {name: part for part, text in PARTS.items() for name in text.split()}
     modules = [m for name, m in list(sys.modules.items()) if name.startswith("visdom_plugin")]
     spaces = modules + [c for m in modules for c in vars(m).values() if isinstance(c, type)]
-    known: dict[object, object] = {parallel.parallel_for: clock.within(parallel.parallel_for)}
+    launch = parallel.parallel_for_each  # by which `parallel_for` launches, too
+    known: dict[object, object] = {launch: clock.within(launch)}
     for space in {id(space): space for space in spaces}.values():
         for name, value in list(vars(space).items()):
             if isinstance(space, type) and issubclass(space, torch.autograd.Function):
@@ -116,11 +119,10 @@ def watch(clock: Clock) -> None:
     torch.Tensor.backward = clock.within(torch.Tensor.backward, names["backward"])
 
 
-def measure(name: str, scene, clock: Clock, threads: int, steps: int, rays: int) -> None:
+def measure(name: str, scene, clock: Clock, threads: int, steps: int, rays: int, budget: str) -> None:
     torch.set_num_threads(threads)
-    method, _, _ = build(
-        registry.find(name), registry.find(name).quick, scene.train, device=torch.device("cpu"), seed=0
-    )
+    preset = registry.find(name)
+    method, _, _ = build(preset, getattr(preset, budget), scene.train, device=torch.device("cpu"), seed=0)
     data = DataManager(scene.train, seed=0)
 
     def step(i: int) -> None:
@@ -161,6 +163,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--steps", type=int, default=160)
     parser.add_argument("--rays", type=int, default=512)
+    parser.add_argument("--budget", choices=["quick", "full"], default="quick")
     args = parser.parse_args()
     scene = make_scene(SyntheticConfig())
     for name in args.methods:
@@ -172,7 +175,7 @@ def main() -> None:
     watch(clock)
     for name in args.methods:
         for threads in args.threads:
-            measure(name, scene, clock, threads, args.steps, args.rays)
+            measure(name, scene, clock, threads, args.steps, args.rays, args.budget)
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ class _Density(torch.autograd.Function):
         if _is_plain(outputs):
             density = torch.empty(len(outputs))
             numbers = outputs.shape[1], np.float32(bias), _flat(outputs), _flat(density)
-            parallel_for(_find_density, len(density), NUMBERS_PER_PIECE, *numbers)
+            parallel_for(find_density, len(density), NUMBERS_PER_PIECE, *numbers)
         else:
             density = torch.exp((outputs[:, 0] + bias).clamp(max=LARGEST))
         ctx.save_for_backward(density)
@@ -84,7 +84,7 @@ class _Density(torch.autograd.Function):
         g = torch.empty(len(density), ctx.width)
         others = np.empty(0, np.float32) if g_outputs is None else _flat(g_outputs)
         numbers = ctx.width, _flat(density), _flat(g_density), others, _flat(g)
-        parallel_for(_density_back, len(density), NUMBERS_PER_PIECE, *numbers)
+        parallel_for(density_back, len(density), NUMBERS_PER_PIECE, *numbers)
         return g, None
 
 
@@ -93,7 +93,7 @@ class _Sigmoid(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, padding: float) -> Tensor:
         out = torch.empty(x.shape)
         ctx.padding = np.float32(padding)
-        parallel_for(_find_sigmoid, x.numel(), NUMBERS_PER_PIECE, _flat(x), ctx.padding, _flat(out))
+        parallel_for(find_sigmoid, x.numel(), NUMBERS_PER_PIECE, _flat(x), ctx.padding, _flat(out))
         ctx.save_for_backward(out)
         return out
 
@@ -103,7 +103,7 @@ class _Sigmoid(torch.autograd.Function):
         (out,) = ctx.saved_tensors
         g = torch.empty(out.shape)
         numbers = _flat(out), ctx.padding, _flat(g_out), _flat(g)
-        parallel_for(_sigmoid_back, out.numel(), NUMBERS_PER_PIECE, *numbers)
+        parallel_for(sigmoid_back, out.numel(), NUMBERS_PER_PIECE, *numbers)
         return g, None
 
 
@@ -132,7 +132,7 @@ def _exp(x):
 
 
 @kernel(error_model="numpy")
-def _find_density(begin, end, width, bias, outputs, density):
+def find_density(begin, end, width, bias, outputs, density):
     largest = np.float32(LARGEST)
     rows = outputs[begin * width : end * width]
     logs = density[begin:end]
@@ -144,7 +144,7 @@ def _find_density(begin, end, width, bias, outputs, density):
 
 
 @kernel(error_model="numpy")
-def _density_back(begin, end, width, density, g_density, g_outputs, g):
+def density_back(begin, end, width, density, g_density, g_outputs, g):
     steepest = np.float32(STEEPEST)
     rows = g[begin * width : end * width]
     given = g_outputs[begin * width : end * width]
@@ -158,7 +158,7 @@ def _density_back(begin, end, width, density, g_density, g_outputs, g):
 
 
 @kernel(error_model="numpy")
-def _find_sigmoid(begin, end, x, padding, out):
+def find_sigmoid(begin, end, x, padding, out):
     one = np.float32(1)
     scale = one + padding + padding
     given, to = x[begin:end], out[begin:end]
@@ -167,7 +167,7 @@ def _find_sigmoid(begin, end, x, padding, out):
 
 
 @kernel(error_model="numpy")
-def _sigmoid_back(begin, end, out, padding, g_out, g):
+def sigmoid_back(begin, end, out, padding, g_out, g):
     one = np.float32(1)
     scale = one + padding + padding
     values, given, to = out[begin:end], g_out[begin:end], g[begin:end]

@@ -72,7 +72,7 @@ def _update(
             p[i] = value * kept - rate * m[i] / (np.sqrt(v[i]) / root + epsilon)
 
 
-def update(updates: Iterable[Update], betas: tuple[float, float], epsilon: float) -> None:
+def update_all(updates: Iterable[Update], betas: tuple[float, float], epsilon: float) -> None:
     """One step of Adam, in place; the same to the bit for any number of threads."""
     real = np.float32
     settings = [real(x) for x in (1 - betas[0], betas[1], 1 - betas[1], epsilon)]

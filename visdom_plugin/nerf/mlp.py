@@ -29,7 +29,11 @@ class Perceptron(nn.Sequential):
 
     def forward(self, x: Tensor, extra: Tensor | None = None, *, lead: int = 0) -> Tensor:
         """See `run_layers`."""
-        return run_layers([layer for layer in self if isinstance(layer, nn.Linear)], x, extra, lead=lead)
+        return run_layers(self.layers, x, extra, lead=lead)
+
+    @property
+    def layers(self) -> list[nn.Linear]:
+        return [layer for layer in self if isinstance(layer, nn.Linear)]
 
 
 def run_layers(
@@ -52,20 +56,9 @@ def run_layers(
         (..., outputs).
     """
     points, rest = x.reshape(-1, x.shape[-1]), None if extra is None else extra.detach().flatten(0, -2)
-    widest = max(max(layer.in_features, layer.out_features) for layer in layers)
-    parameters = [p for layer in layers for p in (layer.weight, layer.bias) if p is not None]
-    if (
-        x.device.type == "cpu"
-        and widest <= WIDEST
-        and all(t.dtype == torch.float32 for t in (x, *parameters))
-    ):
-        shape = Shape(
-            tuple((layer.in_features, layer.out_features) for layer in layers),
-            len(parameters) > len(layers),
-            lead,
-            -1 if again is None else again,
-        )
-        out = _Layers.apply(points, rest, shape, *parameters)
+    parameters = parameters_of(layers)
+    if x.device.type == "cpu" and x.dtype == torch.float32 and has_kernel(layers):
+        out = _Layers.apply(points, rest, shape_of(layers, lead, again), *parameters)
     else:
         out = run_layers_torch(layers, points, rest, lead=lead, again=again)
     return out.reshape(*x.shape[:-1], layers[-1].out_features)
@@ -99,42 +92,81 @@ class Shape(NamedTuple):
     """-1 for none."""
 
 
+def has_kernel(layers: Sequence[nn.Linear]) -> bool:
+    """Whether a net is one for the CPU's kernel."""
+    widest = max(max(layer.in_features, layer.out_features) for layer in layers)
+    return widest <= WIDEST and all(
+        p.dtype == torch.float32 and p.device.type == "cpu" for p in parameters_of(layers)
+    )
+
+
+def parameters_of(layers: Sequence[nn.Linear]) -> list[Tensor]:
+    """Weights and biases in the order in which kernels have them."""
+    return [p for layer in layers for p in (layer.weight, layer.bias) if p is not None]
+
+
+def shape_of(layers: Sequence[nn.Linear], lead: int = 0, again: int | None = None) -> Shape:
+    """See `run_layers`."""
+    sizes = tuple((layer.in_features, layer.out_features) for layer in layers)
+    return Shape(sizes, layers[0].bias is not None, lead, -1 if again is None else again)
+
+
 class _Layers(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, extra, shape, *parameters):
         x = x.contiguous()
         extra = x.new_empty(1, 0) if extra is None else extra.float().contiguous()
-        ctx.save_for_backward(x, extra, *parameters)
-        ctx.shape = shape
+        ctx.save_for_backward(x, *parameters)
+        repeat = max(len(x) // max(len(extra), 1), 1)
+        net = prepare(shape, parameters, len(x), x.shape[1], extra.shape[1], repeat)
+        ctx.net, ctx.extra = net, _flat(extra)
         out = torch.empty(len(x), shape.sizes[-1][1])
-        none = np.empty(0, np.float32)
-        _run(x, extra, shape, parameters, _flat(out), none, none, none)
+        _run(net, len(x), _flat(x), ctx.extra, _flat(out), NONE, NONE, NONE)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx, g_out):
-        x, extra, *parameters = ctx.saved_tensors
-        g_x = torch.empty_like(x)
-        counts = [p.numel() for p in parameters]
-        sums = np.empty((-(-len(x) // mlp_kernels.PIECE), sum(counts)), np.float32)
-        none = np.empty(0, np.float32)
-        _run(x, extra, ctx.shape, parameters, none, _flat(g_out.contiguous()), _flat(g_x), sums.reshape(-1))
-        split = torch.from_numpy(sums.sum(0)).split(counts)
-        return g_x, None, None, *(g.view_as(p) for g, p in zip(split, parameters, strict=True))
+        x, *parameters = ctx.saved_tensors
+        g_x, sums = torch.empty_like(x), sums_of(ctx.net, len(x))
+        gradients = _flat(g_out.contiguous()), _flat(g_x), sums.reshape(-1)
+        _run(ctx.net, len(x), _flat(x), ctx.extra, NONE, *gradients)
+        return g_x, None, None, *add_up(sums, parameters)
 
 
-def _run(x: Tensor, extra: Tensor, shape: Shape, parameters: Sequence[Tensor], *results: np.ndarray) -> None:
-    repeat = max(len(x) // max(len(extra), 1), 1)
-    numbers = np.array([len(x), x.shape[1], shape.lead, extra.shape[1], repeat, shape.again, shape.biased])
+NONE = np.empty(0, np.float32)
+"""In place of an array that is not wanted."""
+
+
+def prepare(
+    shape: Shape, parameters: Sequence[Tensor], points: int, x_row: int, extra_row: int = 0, repeat: int = 1
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `mlp_kernels.run` is told of a net, its points, and of how many of them in a row have the same row of
+    `extra`."""
+    numbers = np.array([points, x_row, shape.lead, extra_row, repeat, shape.again, shape.biased])
     sizes = np.array([*shape.sizes, (shape.sizes[-1][1], 0)], np.int64)
-    flat = torch.cat([p.detach().reshape(-1) for p in parameters])
-    pieces = -(-len(x) // mlp_kernels.PIECE)
-    # A call packs the parameters before it begins.
-    grain = max(pieces // CALLS, 1)
-    parallel_for(
-        mlp_kernels.run, pieces, grain, numbers, sizes, _flat(flat), _flat(x), _flat(extra), *results
-    )
+    return numbers, sizes, np.concatenate([_flat(p) for p in parameters])
+
+
+def grain_of(points: int) -> tuple[int, int]:
+    """Pieces of so many points, and how many of them a call takes: it packs the parameters before it begins."""
+    pieces = -(-points // mlp_kernels.PIECE)
+    return pieces, max(pieces // CALLS, 1)
+
+
+def sums_of(net: tuple[np.ndarray, ...], points: int) -> np.ndarray:
+    """Room for the gradients (pieces, parameters) of a prepared net."""
+    return np.empty((grain_of(points)[0], len(net[2])), np.float32)
+
+
+def add_up(sums: np.ndarray, parameters: Sequence[Tensor]) -> list[Tensor]:
+    """Gradients of the parameters from those of the pieces."""
+    split = torch.from_numpy(sums.sum(0)).split([p.numel() for p in parameters])
+    return [g.view_as(p) for g, p in zip(split, parameters, strict=True)]
+
+
+def _run(net: tuple[np.ndarray, ...], points: int, *arrays: np.ndarray) -> None:
+    parallel_for(mlp_kernels.run, *grain_of(points), *net, *arrays)
 
 
 def _flat(tensor: Tensor) -> np.ndarray:

@@ -95,7 +95,7 @@ class FieldOptimiser:
                 updates.append(
                     adam.Update(of, gradient, mean, square, rate / first, math.sqrt(second), *decays)
                 )
-        adam.update(updates, self.betas, self.epsilon)
+        adam.update_all(updates, self.betas, self.epsilon)
 
     def drop_gradients(self) -> None:
         """Leaves no gradient for the next step to add to."""

@@ -15,6 +15,7 @@ from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.sampler import VisDomSampler
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.fields.ingp import Ingp
+from visdom_plugin.nerf.rendering.ngp_shading import NgpField
 from visdom_plugin.nerf.sampling.occupancy_grid import PackedSamples, select
 from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.protocols import PixelBatch
@@ -44,7 +45,8 @@ def shards(scene):
 
 
 def _poison(method: Ingp, hull: Hull, monkeypatch) -> None:
-    """From here on the field has no value outside the hull."""
+    """From here on the field, in single operations, has no value outside the hull."""
+    monkeypatch.setattr(NgpField, "has_kernels", lambda field: False)
     features = method._features
 
     def poisoned(points):

@@ -21,6 +21,7 @@ from visdom_plugin.geometry.pixel_rays import rays_of_pixels
 from visdom_plugin.hooks.protocols import PixelSampler, SamplerHook
 from visdom_plugin.losses import composite_target, mask_loss
 from visdom_plugin.nerf.frame import Frame
+from visdom_plugin.nerf.rendering.ray_losses import Photographed
 from visdom_plugin.render import Render
 from visdom_plugin.training.protocols import PixelBatch
 
@@ -130,6 +131,11 @@ def spread_rays(camera: Cameras, most: int = 256) -> tuple[Tensor, Tensor]:
     )
     grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2)
     return rays_of(camera.to(dtype=torch.float64), grid)
+
+
+def photographed(batch: PixelBatch) -> Photographed:
+    """What `ray_losses` compares rays with."""
+    return Photographed(batch.rgb, batch.mask, batch.mask_known)
 
 
 def photograph_on(background: Tensor, batch: PixelBatch, alpha: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Generator, Tensor
 
 from visdom_plugin.geometry.cameras import Cameras
-from visdom_plugin.methods.fields.common import psnr_of, silhouette_loss
+from visdom_plugin.methods.fields.common import LocalRays, photographed
 from visdom_plugin.methods.fields.configs import IngpConfig
 from visdom_plugin.methods.fields.marched import MarchedField
 from visdom_plugin.nerf.activations import density_of, padded_sigmoid
@@ -14,7 +14,9 @@ from visdom_plugin.nerf.encoding.hash_grid import encode, initial_table
 from visdom_plugin.nerf.encoding.view_directions import encode_harmonics
 from visdom_plugin.nerf.mlp import perceptron
 from visdom_plugin.nerf.optimiser import FieldOptimiser, warm_up_and_steps
-from visdom_plugin.nerf.sampling.occupancy_grid import OccupancyGrid
+from visdom_plugin.nerf.rendering.ngp_shading import NgpField, shade
+from visdom_plugin.nerf.rendering.ray_losses import ray_losses
+from visdom_plugin.nerf.sampling.occupancy_grid import OccupancyGrid, PackedSamples
 from visdom_plugin.training.protocols import PixelBatch, StepOutput
 
 HUBER_DELTA = 0.1  # Instant-NGP
@@ -50,13 +52,14 @@ class Ingp(MarchedField[IngpConfig]):
 
     def train_step(self, batch: PixelBatch, step: int) -> StepOutput:
         c, n = self.config, len(batch.mask)
-        rgb, alpha, target, samples = self.draw(batch, step)
+        rgb, alpha, background, samples = self.draw(batch, step)
         self._adapt(n, samples)
-        losses = {"colour": torch.nn.functional.huber_loss(rgb, target, delta=HUBER_DELTA) / HUBER_DELTA}
+        found = ray_losses(rgb, alpha, photographed(batch), background, HUBER_DELTA, c.mask_weight)
+        losses = {"colour": found.colour}
         if c.mask_weight:
-            losses["mask"] = c.mask_weight * silhouette_loss(alpha, batch)
+            losses["mask"] = found.mask
         losses |= self.prior_losses(step) | self.empty_losses(n, step)
-        return StepOutput(losses, {"psnr": psnr_of(rgb - target)})
+        return StepOutput(losses, {"psnr": found.psnr})
 
     def optimise(self, step: int, output: StepOutput) -> None:
         c = self.config
@@ -84,6 +87,21 @@ class Ingp(MarchedField[IngpConfig]):
 
     def _look(self, features: Tensor, views: Tensor) -> Tensor:
         return padded_sigmoid(self.colour_net(features, views, lead=1))
+
+    def _shade(
+        self, rays: LocalRays, samples: PackedSamples, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        field = NgpField(
+            self.config.grid,
+            self.table,
+            self.density_net,
+            self.colour_net,
+            self.config.half_side,
+            self.config.density_bias,
+        )
+        if not field.has_kernels():
+            return super()._shade(rays, samples, background)
+        return shade(field, rays.origins, rays.directions, samples, background)
 
     def _adapt(self, rays: int, samples: int) -> None:
         wanted = int(rays * self.config.samples_per_step / max(samples, 1))

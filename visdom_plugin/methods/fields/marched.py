@@ -19,7 +19,6 @@ from visdom_plugin.methods.fields.common import (
     LocalRays,
     export_mesh,
     mesh_density,
-    photograph_on,
     spread_rays,
 )
 from visdom_plugin.methods.fields.configs import IngpConfig, ZeroRfConfig
@@ -46,8 +45,8 @@ class Drawn(NamedTuple):
     """(n, 3) over the background."""
     alpha: Tensor
     """(n,)."""
-    target: Tensor
-    """(n, 3) what the photographs show, on the same background."""
+    background: Tensor
+    """(n, 3)."""
     samples: int
     """Along all rays."""
 
@@ -94,7 +93,7 @@ class MarchedField(RadianceField[Config]):
         samples = self._take_samples(rays, rays.far, step_length, shift, self.hooks, self.occupancy)
         rgb, alpha, _ = self._shade(rays, samples, background)
         rgb = self.correct(rgb, alpha, background, batch.pixels)
-        return Drawn(rgb, alpha, photograph_on(background, batch, alpha), len(samples.ray))
+        return Drawn(rgb, alpha, background, len(samples.ray))
 
     def silhouette_of_nothing(
         self, rays: LocalRays, radius: Tensor, step: int, generator: Generator

@@ -19,6 +19,7 @@ from visdom_plugin.methods.fields.common import (
     MESH_RESOLUTION,
     FieldMesh,
     LocalRays,
+    photograph_on,
     psnr_of,
     silhouette_loss,
 )
@@ -103,8 +104,8 @@ class ZeroRfLite(MarchedField[ZeroRfConfig]):
 
     def _train_step(self, batch: PixelBatch, step: int) -> StepOutput:
         c = self.config
-        rgb, alpha, target, _ = self.draw(batch, step)
-        error = rgb - target
+        rgb, alpha, background, _ = self.draw(batch, step)
+        error = rgb - photograph_on(background, batch, alpha)
         squares = error.square().sum(-1)
         if c.compare_alpha:
             wrong = alpha - batch.mask

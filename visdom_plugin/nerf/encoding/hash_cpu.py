@@ -39,7 +39,7 @@ def encode_cpu(
 
 
 @cache
-def _describe(layout: HashLayout) -> tuple[np.ndarray, ...]:
+def describe(layout: HashLayout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Resolutions, whether dense, masks of the hash, first rows (and their number): what the kernels read."""
     masks = [0 if dense else size - 1 for dense, size in zip(layout.dense, layout.sizes, strict=True)]
     return (
@@ -70,7 +70,7 @@ class _Encode(torch.autograd.Function):
         blocks = -(-groups // (hash_kernels.BLOCK // samples))
         parallel_for(
             hash_kernels.encode, layout.levels * blocks, max(blocks // PIECES_PER_LEVEL, 1), samples,
-            _flat(points), _flat(scales), _flat(table), layout.features, *_describe(layout),
+            _flat(points), _flat(scales), _flat(table), layout.features, *describe(layout),
             _flat(spans), _flat(out), _flat(mean_strengths),
         )  # fmt: skip
         ctx.mark_non_differentiable(mean_strengths)
@@ -84,16 +84,16 @@ class _Encode(torch.autograd.Function):
         g_table = torch.empty(layout.rows, layout.features)
         if g_out is None:
             g_out = torch.zeros(len(points), layout.width)
-        decay = None if g_squares is None else g_squares * _share_of_each(layout)
+        decay = None if g_squares is None else g_squares * share_of_each(layout)
         parallel_for(
             hash_kernels.encode_backward, layout.levels, 1, samples, _flat(points), _flat(scales),
-            _flat(g_out), layout.features, *_describe(layout), _flat(table), _flat(decay), _flat(g_table),
+            _flat(g_out), layout.features, *describe(layout), _flat(table), _flat(decay), _flat(g_table),
         )  # fmt: skip
         return g_table, None, None, None, None, None
 
 
 @cache
-def _share_of_each(layout: HashLayout) -> Tensor:
+def share_of_each(layout: HashLayout) -> Tensor:
     """(levels,) slope of a mean square by a feature of the level, over the feature."""
     return 2 / (torch.tensor(layout.sizes, dtype=torch.float32) * layout.features)
 
@@ -101,7 +101,7 @@ def _share_of_each(layout: HashLayout) -> Tensor:
 def mean_squares(table: Tensor, layout: HashLayout) -> Tensor:
     """(levels,) means of the squared features of each level of a table, without gradient."""
     out = torch.empty(layout.levels)
-    offsets = _describe(layout)[-1]
+    offsets = describe(layout)[-1]
     parallel_for(
         hash_kernels.mean_squares, layout.levels, 1, _flat(table), layout.features, offsets, _flat(out)
     )

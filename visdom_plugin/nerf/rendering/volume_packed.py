@@ -42,8 +42,8 @@ def composite_packed(
         without samples; and the weights (M,), detached.
     """
     density = density.clamp_max(MAX_DENSITY)
-    compose = _Composite.apply if density.device.type == "cpu" else _composite_torch
-    return compose(density, rgb, starts.detach(), ends.detach(), ray_offsets, background)
+    run = _Composite.apply if density.device.type == "cpu" else _composite_torch
+    return run(density, rgb, starts.detach(), ends.detach(), ray_offsets, background)
 
 
 def _composite_torch(density, rgb, starts, ends, ray_offsets, background):
@@ -80,7 +80,7 @@ class _Composite(torch.autograd.Function):
         real = arrays[0].dtype
         colour, alpha, depth = np.empty((n, 3), real), np.empty(n, real), np.empty(n, real)
         weights, passed = np.empty(len(density), real), np.empty(len(density), real)
-        parallel_for(_forward, n, RAYS_PER_PIECE, *arrays, colour, alpha, depth, weights, passed)
+        parallel_for(compose, n, RAYS_PER_PIECE, *arrays, colour, alpha, depth, weights, passed)
         ctx.arrays = (*arrays[1:], alpha, depth, weights, passed)
         out = [torch.from_numpy(x) for x in (colour, alpha, depth, weights)]
         ctx.mark_non_differentiable(out[3])
@@ -97,13 +97,13 @@ class _Composite(torch.autograd.Function):
             np.empty((n, 3), rgb.dtype),
         )
         given = [g.contiguous().numpy() for g in (by_colour, by_alpha, by_depth)]
-        parallel_for(_backward, n, RAYS_PER_PIECE, *ctx.arrays, *given, by_density, by_rgb, by_background)
+        parallel_for(compose_back, n, RAYS_PER_PIECE, *ctx.arrays, *given, by_density, by_rgb, by_background)
         by_density, by_rgb, by_background = (torch.from_numpy(x) for x in (by_density, by_rgb, by_background))
         return by_density, by_rgb, None, None, None, by_background
 
 
 @kernel(error_model="numpy")
-def _forward(
+def compose(
     begin, end, density, rgb, starts, ends, offsets, background, colour, alpha, depth, weights, passed
 ):
     for ray in range(begin, end):
@@ -127,7 +127,7 @@ def _forward(
 
 
 @kernel(error_model="numpy")
-def _backward(
+def compose_back(
     begin, end, rgb, starts, ends, offsets, background, alpha, depth, weights, passed,
     by_colour, by_alpha, by_depth, by_density, by_rgb, by_background,
 ):  # fmt: skip

@@ -259,7 +259,7 @@ def middles_of(origins: Tensor, directions: Tensor, samples: PackedSamples) -> T
         return _middles_torch(origins, directions, samples)
     arrays = [x.detach().contiguous().numpy() for x in (origins, directions, *samples[1:])]
     out = np.empty((len(samples.ray), 3), np.float32)
-    parallel_for(_middles, len(out), 8192, *arrays, out)
+    parallel_for(find_middles, len(out), 8192, *arrays, out)
     return torch.from_numpy(out)
 
 
@@ -269,7 +269,7 @@ def _middles_torch(origins: Tensor, directions: Tensor, samples: PackedSamples) 
 
 
 @kernel(error_model="numpy")
-def _middles(begin, end, origins, directions, ray, starts, ends, out):
+def find_middles(begin, end, origins, directions, ray, starts, ends, out):
     for i in range(begin, end):
         middle, r = (starts[i] + ends[i]) / np.float32(2), ray[i]
         for axis in range(3):
