@@ -14,6 +14,7 @@ from tests.methods.short_runs import advance, copy_of, same, set_up
 from visdom_plugin import registry
 from visdom_plugin.errors import ConfigError
 from visdom_plugin.geometry.cameras import rays_of
+from visdom_plugin.methods.fields.common import photograph_on
 from visdom_plugin.methods.fields.zerorf_lite import ZeroRfLite, fit_cube
 from visdom_plugin.nerf.optimiser import FieldOptimiser
 from visdom_plugin.nerf.sampling.occupancy_grid import OccupancyGrid, intersect_cube
@@ -90,7 +91,8 @@ def test_the_loss_is_the_mean_square_over_colours_and_opacity(scene):
         method = start(scene, compare_alpha=alpha)
         with torch.no_grad(), method._make_once():
             drawn = method.draw(batch, 0)
-        channels = [drawn.rgb - drawn.target] + [(drawn.alpha - batch.mask)[:, None]] * alpha
+        target = photograph_on(drawn.background, batch, drawn.alpha)
+        channels = [drawn.rgb - target] + [(drawn.alpha - batch.mask)[:, None]] * alpha
         # The occupancy grid is brought up to date from the same numbers again.
         losses = start(scene, compare_alpha=alpha).train_step(batch, 0).losses
         assert losses.keys() == {"colour"}
