@@ -15,7 +15,6 @@ from visdom_plugin.errors import ConfigError
 from visdom_plugin.hooks.sampler import VisDomSampler
 from visdom_plugin.hull.hull import Hull
 from visdom_plugin.methods.fields.ingp import Ingp
-from visdom_plugin.nerf.rendering.ngp_shading import NgpField
 from visdom_plugin.nerf.sampling.occupancy_grid import PackedSamples, select
 from visdom_plugin.training.batches import DataManager
 from visdom_plugin.training.protocols import PixelBatch
@@ -45,8 +44,7 @@ def shards(scene):
 
 
 def _poison(method: Ingp, hull: Hull, monkeypatch) -> None:
-    """From here on the field, in single operations, has no value outside the hull."""
-    monkeypatch.setattr(NgpField, "has_kernels", lambda field: False)
+    """From here on the field has no value outside the hull."""
     features = method._features
 
     def poisoned(points):

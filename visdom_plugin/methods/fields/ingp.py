@@ -99,7 +99,9 @@ class Ingp(MarchedField[IngpConfig]):
             self.config.half_side,
             self.config.density_bias,
         )
-        if not field.has_kernels():
+        # Whoever changes a part of the field, as a subclass does, gets its parts one after the other.
+        changed = self._features != Ingp._features.__get__(self) or self._look != Ingp._look.__get__(self)
+        if changed or not field.has_kernels():
             return super()._shade(rays, samples, background)
         return shade(field, rays.origins, rays.directions, samples, background)
 
